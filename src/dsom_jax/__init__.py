@@ -1,0 +1,1 @@
+"""Find a lidar robot on a known map: DSOM and AdaM MCL in JAX."""

@@ -1,0 +1,111 @@
+"""The 2D lidar: geometry of its beams, range conventions, noise, and the scan as an image."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dsom_jax.types import Array, Key
+
+
+@dataclass(frozen=True)
+class LidarConfig:
+    """Geometry of a scan.
+
+    Attributes:
+        beams: number of ranges in a scan.
+        angle_min: bearing of the first beam in the sensor frame, radians.
+        angle_increment: bearing between beams, radians.
+        range_min: metres; shorter is too close (-inf).
+        range_max: metres; longer is no return (+inf). ``laser_max_range`` of nav2.
+        mount: pose (x, y, yaw) of the sensor in the base frame.
+        upside_down: the sensor hangs head down, so bearings run clockwise.
+    """
+
+    beams: int = 360
+    angle_min: float = -math.pi
+    angle_increment: float = 2 * math.pi / 360
+    range_min: float = 0.0
+    range_max: float = 10.0
+    mount: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    upside_down: bool = False
+
+    def __post_init__(self) -> None:
+        if self.beams < 1:
+            raise ValueError(f"LidarConfig.beams = {self.beams}: give at least one beam")
+        if not 0 <= self.range_min < self.range_max or not math.isfinite(self.range_max):
+            raise ValueError(f"LidarConfig: need 0 <= range_min < range_max, got {self.range_min}, {self.range_max} m")
+        if abs(self.angle_min) > 2 * math.pi + 1e-3 or self.beams * abs(self.angle_increment) > 2 * math.pi * 1.01:
+            raise ValueError("LidarConfig: beams span more than a turn. Did you pass degrees instead of radians?")
+
+    @property
+    def fov(self) -> float:
+        """Angle covered by the scan, radians."""
+        return self.beams * abs(self.angle_increment)
+
+    def angles(self) -> np.ndarray:
+        """(B,) bearings of the beams in the base frame, radians, mount yaw and ``upside_down`` applied."""
+        bearings = self.angle_min + self.angle_increment * np.arange(self.beams)
+        return np.asarray(self.mount[2] + (-bearings if self.upside_down else bearings), np.float32)
+
+    def every(self, step: int) -> LidarConfig:
+        """The scan that keeps beams 0, step, 2 step, ..."""
+        return replace(self, beams=-(-self.beams // step), angle_increment=self.angle_increment * step)
+
+
+@dataclass(frozen=True)
+class LidarNoise:
+    """Imperfections of the ranges.
+
+    Attributes:
+        sigma: standard deviation, metres.
+        sigma_relative: standard deviation per metre of range.
+        dropout: probability that a beam does not return.
+        short: probability that something unknown returns the beam early, uniformly along it.
+    """
+
+    sigma: float = 0.0
+    sigma_relative: float = 0.0
+    dropout: float = 0.0
+    short: float = 0.0
+
+
+def apply_limits(ranges: Array, lidar: LidarConfig) -> Array:
+    """Ranges with the conventions of REP-117: beyond ``range_max`` +inf, below ``range_min`` -inf, NaN kept."""
+    ranges = jnp.where(ranges >= lidar.range_max, jnp.inf, ranges)
+    return jnp.where(ranges < lidar.range_min, -jnp.inf, ranges)
+
+
+def observe(key: Key, ranges: Array, lidar: LidarConfig, noise: LidarNoise) -> Array:
+    """Noisy scan (..., B) of a clean one: early returns, then Gaussian noise, then dropout, then limits."""
+    k_short, k_where, k_noise, k_drop = jax.random.split(key, 4)
+    reach = jnp.minimum(ranges, lidar.range_max)
+    early = reach * jax.random.uniform(k_where, ranges.shape)
+    ranges = jnp.where(jax.random.uniform(k_short, ranges.shape) < noise.short, early, ranges)
+    spread = noise.sigma + noise.sigma_relative * reach
+    ranges = ranges + spread * jax.random.normal(k_noise, ranges.shape)
+    ranges = jnp.where(jax.random.uniform(k_drop, ranges.shape) < noise.dropout, jnp.inf, ranges)
+    return apply_limits(ranges, lidar)
+
+
+def scan_points(ranges: Array, lidar: LidarConfig) -> tuple[Array, Array]:
+    """End points (..., B, 2) of the beams in the base frame, metres, and which of them are real returns (..., B)."""
+    angles = jnp.asarray(lidar.angles())
+    valid = jnp.isfinite(ranges)
+    reach = jnp.where(valid, ranges, 0.0)
+    x = lidar.mount[0] + reach * jnp.cos(angles)
+    y = lidar.mount[1] + reach * jnp.sin(angles)
+    return jnp.stack([x, y], axis=-1), valid
+
+
+def scan_image(ranges: Array, lidar: LidarConfig, resolution: float, size: int) -> Array:
+    """Scan (B,) drawn as M_scan (size, size): 1 where a beam ends, base in the centre, x along +j, y along +i."""
+    points, valid = scan_points(ranges, lidar)
+    cells = jnp.floor(points / resolution + size / 2).astype(jnp.int32)
+    j, i = jnp.where(valid[:, None], cells, -1).T
+    i, j = (jnp.where((v >= 0) & (v < size), v, size) for v in (i, j))
+    return jnp.zeros((size, size)).at[i, j].max(1.0, mode="drop")

@@ -1,0 +1,34 @@
+"""Resampling: which ancestors survive."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+
+from dsom_jax.types import Array, Key
+
+Resampling = Literal["systematic", "multinomial"]
+
+
+def pick(cumulative: Array, positions: Array) -> Array:
+    """Index of the first entry of ``cumulative`` (n,) above each of ``positions`` in [0, 1): never a zero weight.
+
+    Positions are scaled by the last entry, as float32 sums fall short of one, and kept below it.
+    """
+    total = cumulative[-1]
+    scaled = jnp.minimum(positions * total, jnp.nextafter(total, jnp.zeros_like(total)))
+    return jnp.searchsorted(cumulative, scaled, side="right", method="scan_unrolled").astype(jnp.int32)
+
+
+def positions(key: Key, n: int, method: Resampling) -> Array:
+    """(n,) positions in [0, 1): one stratum each for ``systematic``, independent for ``multinomial``."""
+    if method == "systematic":
+        return (jnp.arange(n) + jax.random.uniform(key)) / n
+    return jax.random.uniform(key, (n,))
+
+
+def resample(key: Key, weights: Array, n: int, method: Resampling = "systematic") -> Array:
+    """(n,) ancestors drawn by ``weights`` (m,), which need not be normalised (Probabilistic Robotics, table 4.4)."""
+    return pick(jnp.cumsum(weights), positions(key, n, method))
