@@ -1,0 +1,147 @@
+"""Motion models p(x' | a, x); the increment ``a`` is in the previous base frame (m, m, rad)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from jax.scipy.stats import norm
+
+from dsom_jax.geometry import compose, relative, wrap_angle
+from dsom_jax.types import Array, Key
+
+
+@dataclass(frozen=True)
+class OdometryMotion:
+    """Odometry model of a differential drive (Probabilistic Robotics, tables 5.5 and 5.6; nav2 parameters).
+
+    Attributes:
+        alpha1: rotation noise from rotation.
+        alpha2: rotation noise from translation, rad^2 / m^2.
+        alpha3: translation noise from translation.
+        alpha4: translation noise from rotation, m^2 / rad^2.
+        min_xy, min_theta: standard deviations (m, rad) added however little the robot moved; positive, so that
+            particles never coincide and densities stay finite.
+    """
+
+    alpha1: float = 0.2
+    alpha2: float = 0.2
+    alpha3: float = 0.2
+    alpha4: float = 0.2
+    min_xy: float = 0.02
+    min_theta: float = 0.01
+
+    def __post_init__(self) -> None:
+        if min(self.alpha1, self.alpha2, self.alpha3, self.alpha4, self.min_xy, self.min_theta) < 0:
+            raise ValueError("OdometryMotion: noise parameters cannot be negative")
+
+    def spread(self, odometry: Array) -> tuple[Array, Array]:
+        """Rotation-translation-rotation (3,) of an increment and the standard deviations (3,) of its parts."""
+        travel = jnp.hypot(odometry[0], odometry[1])
+        first = jnp.where(travel < 0.01, 0.0, jnp.arctan2(odometry[1], odometry[0]))
+        second = wrap_angle(odometry[2] - first)
+        turn1, turn2 = (jnp.minimum(jnp.abs(r), jnp.abs(wrap_angle(r - jnp.pi))) for r in (first, second))
+        by_travel = self.alpha2 * travel**2 + self.min_theta**2
+        variances = (
+            self.alpha1 * turn1**2 + by_travel,
+            self.alpha3 * travel**2 + self.alpha4 * (turn1**2 + turn2**2) + self.min_xy**2,
+            self.alpha1 * turn2**2 + by_travel,
+        )
+        return jnp.stack([first, travel, second]), jnp.sqrt(jnp.stack(variances))
+
+    def sample(self, key: Key, poses: Array, odometry: Array) -> Array:
+        """One successor of each pose (..., 3)."""
+        parts, sigma = self.spread(odometry)
+        k_parts, k_floor = jax.random.split(key)
+        noise = jax.random.normal(k_parts, (*poses.shape[:-1], 3))
+        first, travel, second = jnp.moveaxis(parts + sigma * noise, -1, 0)
+        step = jnp.stack([travel * jnp.cos(first), travel * jnp.sin(first), first + second], axis=-1)
+        floor = self.min_xy * jax.random.normal(k_floor, (*poses.shape[:-1], 2))
+        return compose(poses, step.at[..., :2].add(floor))
+
+    def log_prob(self, new_poses: Array, poses: Array, odometry: Array) -> Array:
+        """Log density (...) in 1 / (m^2 rad), Gaussian about the mean increment (first order in the noise)."""
+        parts, sigma = self.spread(odometry)
+        error = relative(compose(poses, odometry), new_poses)
+        ahead = wrap_angle(parts[0] - odometry[2])
+        along = error[..., 0] * jnp.cos(ahead) + error[..., 1] * jnp.sin(ahead)
+        across = error[..., 1] * jnp.cos(ahead) - error[..., 0] * jnp.sin(ahead)
+        sigma_along = jnp.hypot(sigma[1], self.min_xy)
+        sigma_across = jnp.hypot(parts[1] * sigma[0], self.min_xy)
+        sigma_turn = jnp.hypot(sigma[0], sigma[2])
+        bend = parts[1] * sigma[0] ** 2 / sigma_across**2
+        left = jnp.sqrt(jnp.maximum(sigma_turn**2 - bend**2 * sigma_across**2, 1e-12))
+        turn = wrap_angle(error[..., 2] - bend * across)
+        return norm.logpdf(along, 0, sigma_along) + norm.logpdf(across, 0, sigma_across) + norm.logpdf(turn, 0, left)
+
+
+@dataclass(frozen=True)
+class OmniMotion:
+    """Omnidirectional drive: independent noise on both translations and the rotation (nav2, alpha5 = strafing).
+
+    Attributes:
+        alpha1, alpha2, alpha3, alpha4: as in :class:`OdometryMotion`.
+        alpha5: sideways noise from translation.
+        min_xy, min_theta: floors of the standard deviations (m, rad).
+    """
+
+    alpha1: float = 0.2
+    alpha2: float = 0.2
+    alpha3: float = 0.2
+    alpha4: float = 0.2
+    alpha5: float = 0.2
+    min_xy: float = 0.02
+    min_theta: float = 0.01
+
+    def spread(self, odometry: Array) -> Array:
+        """Standard deviations (3,) along the direction of travel, across it, and of the heading."""
+        travel2, turn2 = odometry[0] ** 2 + odometry[1] ** 2, odometry[2] ** 2
+        floor = jnp.array([self.min_xy, self.min_xy, self.min_theta]) ** 2
+        gains = jnp.array([[self.alpha3, self.alpha4], [self.alpha5, self.alpha4], [self.alpha2, self.alpha1]])
+        return jnp.sqrt(gains @ jnp.stack([travel2, turn2]) + floor)
+
+    def _frame(self, poses: Array, odometry: Array) -> Array:
+        """Mean successor, turned into the direction of travel."""
+        way = jnp.arctan2(odometry[1], odometry[0])
+        mean = compose(poses, odometry)
+        return mean.at[..., 2].set(poses[..., 2] + way)
+
+    def sample(self, key: Key, poses: Array, odometry: Array) -> Array:
+        """One successor of each pose (..., 3)."""
+        noise = self.spread(odometry) * jax.random.normal(key, poses.shape)
+        moved = compose(self._frame(poses, odometry), noise)
+        return moved.at[..., 2].set(wrap_angle(poses[..., 2] + odometry[2] + noise[..., 2]))
+
+    def log_prob(self, new_poses: Array, poses: Array, odometry: Array) -> Array:
+        """Log density (...) in 1 / (m^2 rad)."""
+        error = relative(self._frame(poses, odometry), new_poses)
+        turn = wrap_angle(new_poses[..., 2] - poses[..., 2] - odometry[2])
+        error = jnp.concatenate([error[..., :2], turn[..., None]], axis=-1)
+        return norm.logpdf(error, 0.0, self.spread(odometry)).sum(-1)
+
+
+@dataclass(frozen=True)
+class AdditiveMapFrame:
+    """Eq 14, the authors' own: s' = s + a + N(0, sigma), where ``a`` is an increment in the *map* frame.
+
+    Such increments tell the filter the heading; it is kept for parity runs only, on episodes made for it.
+
+    Attributes:
+        sigma_xy, sigma_theta: standard deviations, metres and radians.
+    """
+
+    sigma_xy: float = 0.1
+    sigma_theta: float = 0.05
+
+    def sample(self, key: Key, poses: Array, odometry: Array) -> Array:
+        """One successor of each pose (..., 3)."""
+        sigma = jnp.array([self.sigma_xy, self.sigma_xy, self.sigma_theta])
+        moved = poses + odometry + sigma * jax.random.normal(key, poses.shape)
+        return moved.at[..., 2].set(wrap_angle(moved[..., 2]))
+
+    def log_prob(self, new_poses: Array, poses: Array, odometry: Array) -> Array:
+        """Log density (...) in 1 / (m^2 rad)."""
+        error = new_poses - poses - odometry
+        error = error.at[..., 2].set(wrap_angle(error[..., 2]))
+        return norm.logpdf(error, 0.0, jnp.array([self.sigma_xy, self.sigma_xy, self.sigma_theta])).sum(-1)

@@ -1,0 +1,217 @@
+"""Ray casting on an occupancy grid: exact by empty-square skipping, or looked up in a precomputed table.
+
+Accuracy and speed of both are measured by ``experiments/perf/raycast.py``; the worst case of the table is at the
+edges of obstacles, where the ray from the pose and the one from the centre of its cell meet different walls.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+
+from dsom_jax.geometry import compose
+from dsom_jax.lidar import LidarConfig
+from dsom_jax.occupancy import OccupancyGrid, inside
+from dsom_jax.types import Array
+
+_NUDGE = 1e-3  # cells; larger than float32 rounding at 4,000 cells, smaller than anything a lidar resolves
+_FIRST_STEPS, _MORE_STEPS, _GROUP = 6, 8, 64
+
+
+@dataclass(frozen=True)
+class RaycastConfig:
+    """How expected ranges are obtained.
+
+    Attributes:
+        method: ``exact`` marches every ray; ``table`` looks up the wall that the ray from the centre of the cell, at
+            the nearest of ``angles`` directions, would meet, and intersects the actual ray with that wall.
+        angles: directions per cell of the table.
+        max_skip: side of the largest empty square stored, cells.
+    """
+
+    method: Literal["exact", "table"] = "exact"
+    angles: int = 360
+    max_skip: int = 31
+
+    def __post_init__(self) -> None:
+        if self.method not in ("exact", "table"):
+            raise ValueError(f"RaycastConfig.method = {self.method!r}: use 'exact' or 'table'")
+        if self.angles < 4 or not 1 <= self.max_skip <= 255:
+            raise ValueError("RaycastConfig: need angles >= 4 and 1 <= max_skip <= 255")
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class MapTables:
+    """A map with what ray casting precomputes of it.
+
+    Attributes:
+        grid: the map.
+        squares: (4, H + 2, W + 2) uint8, side of the largest empty square whose corner is the cell and that extends
+            to -x-y, +x-y, -x+y, +x+y; zero on occupied cells and on a border one cell wide around the map.
+        walls: (H, W, A) int16 or None, first wall from the centre of the cell: 2 * coordinate + axis, -1 for none.
+        range_max: metres up to which ``walls`` was computed (static).
+    """
+
+    grid: OccupancyGrid
+    squares: Array
+    walls: Array | None
+    range_max: float = field(metadata={"static": True})
+
+
+def make_tables(grid: OccupancyGrid, config: RaycastConfig, range_max: float) -> MapTables:
+    """Tables for :func:`cast_rays` up to ``range_max`` metres; jit-able."""
+    squares = empty_squares(jnp.pad(grid.occupied, 1, constant_values=True), config.max_skip)
+    tables = MapTables(grid, squares, None, range_max)
+    if config.method == "exact":
+        return tables
+    return MapTables(grid, squares, _first_walls(tables, config.angles), range_max)
+
+
+def empty_squares(blocked: Array, cap: int) -> Array:
+    """(4, H, W) uint8 side of the largest empty square extending from each cell into each quadrant, at most ``cap``."""
+    return jnp.stack([_squares_into(blocked, up, right, cap) for up in (False, True) for right in (False, True)])
+
+
+def _squares_into(blocked: Array, up: bool, right: bool, cap: int) -> Array:
+    flip = partial(jnp.flip, axis=[axis for axis, keep in enumerate((up, right)) if not keep])
+
+    def grow(carry: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
+        hit, side = carry
+        hit = hit.at[:-1].max(hit[1:])
+        hit = hit.at[:, :-1].max(hit[:, 1:])
+        return (hit, side + ~hit), None
+
+    start = flip(blocked)
+    (_, side), _ = jax.lax.scan(grow, (start, (~start).astype(jnp.uint8)), length=cap - 1)
+    return flip(side)
+
+
+def cast_rays(tables: MapTables, poses: Array, lidar: LidarConfig) -> Array:
+    """Expected ranges (..., B) in metres from map-frame base poses (..., 3); +inf beyond ``lidar.range_max``.
+
+    A pose outside of the map sees nothing, one on an occupied cell sees zeros.
+    """
+    sensor = tables.grid.to_grid(compose(poses, jnp.asarray(lidar.mount)))
+    bearings = jnp.asarray(lidar.angles()) - lidar.mount[2]
+    x, y = (sensor[..., axis, None] / tables.grid.resolution for axis in (0, 1))
+    limit = lidar.range_max / tables.grid.resolution
+    if tables.walls is None:
+        reach = march(tables.squares, x, y, *_directions(sensor[..., 2], bearings), limit)
+    else:
+        reach = _meet_walls(tables.walls, x, y, sensor[..., 2], bearings)
+    return jnp.where(reach < limit, reach * tables.grid.resolution, jnp.inf)
+
+
+def _directions(theta: Array, bearings: Array) -> tuple[Array, Array]:
+    """Unit vectors of ``theta`` (...) + ``bearings`` (B,), by the addition theorem: no trigonometry per ray."""
+    c, s = jnp.cos(theta)[..., None], jnp.sin(theta)[..., None]
+    cb, sb = jnp.cos(bearings), jnp.sin(bearings)
+    return c * cb - s * sb, s * cb + c * sb
+
+
+def march(squares: Array, x: Array, y: Array, dx: Array, dy: Array, limit: float) -> Array:
+    """Distance in cells along rays from (x, y) to the first occupied cell; inf from ``limit`` on or off the map.
+
+    Every step leaps out of the largest empty square ahead. All rays take a few steps together; the few that are still
+    under way (grazing a wall) are then taken up one per group of 64, so that they do not hold up the rest.
+    """
+    shape = jnp.broadcast_shapes(x.shape, dx.shape)
+    known = inside((squares.shape[1] - 2, squares.shape[2] - 2), y, x)
+    known &= jnp.isfinite(dx) & jnp.isfinite(dy)
+    rays = [jnp.where(known, v + shift, 0.5).ravel() for v, shift in ((x, 1.0), (y, 1.0))]
+    rays += [jnp.where(known, v, 0.6).ravel() for v in (dx, dy)]
+    count = math.prod(shape)
+    groups = -(-count // _GROUP)
+    rays = [jnp.pad(v, (0, groups * _GROUP - count), constant_values=0.5) for v in rays]
+    rays = jax.lax.optimization_barrier(rays)
+    reach = _march_flat(squares, rays, limit)[:count].reshape(shape)
+    return jnp.where(known & (reach < limit) & ~_on_border(squares, x, y, dx, dy, reach), reach, jnp.inf)
+
+
+def _march_flat(squares: Array, rays: list[Array], limit: float) -> Array:
+    groups = rays[0].size // _GROUP
+    reach, side = _leap(squares, rays, jnp.zeros_like(rays[0]), _FIRST_STEPS)
+    rounds = _GROUP * (1 + sum(squares.shape[1:]) // _MORE_STEPS)
+
+    def one_per_group(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        reach, live, count = state
+        order = jnp.arange(_GROUP, dtype=jnp.int32)[:, None]
+        first = jnp.where(live.reshape(_GROUP, groups), order, _GROUP - 1).min(0)
+        chosen = first * groups + jnp.arange(groups, dtype=jnp.int32)
+        got, side = _leap(squares, [_at(v, chosen) for v in rays], _at(reach, chosen), _MORE_STEPS)
+        put = dict(mode="promise_in_bounds", unique_indices=True)
+        live = live.at[chosen].set((side > 0) & (got < limit), **put)
+        return reach.at[chosen].set(got, **put), live, count + 1
+
+    state = (reach, (side > 0) & (reach < limit), jnp.int32(0))
+    return jax.lax.while_loop(lambda s: s[1].any() & (s[2] < rounds), one_per_group, state)[0]
+
+
+def _at(values: Array, index: Array) -> Array:
+    return values.at[index].get(mode="promise_in_bounds")
+
+
+def _leap(squares: Array, rays: list[Array], reach: Array, steps: int) -> tuple[Array, Array]:
+    """``steps`` leaps of rays that lie inside of the bordered map; ones that arrived stay where they are."""
+    x, y, dx, dy = rays
+    _, height, width = squares.shape
+    flat = squares.reshape(-1)
+    right, up = dx >= 0, dy >= 0
+    layer = jnp.where(up, 2 * height * width, 0) + jnp.where(right, height * width, 0)
+    per_x, per_y = (1 / jnp.where(jnp.abs(v) < 1e-9, 1e-9, v) for v in (dx, dy))
+    sign_x, sign_y = jnp.where(right, 1.0, -1.0), jnp.where(up, 1.0, -1.0)
+    edge_x, edge_y = jnp.where(right, 0.0, 1.0) - x, jnp.where(up, 0.0, 1.0) - y
+    ahead_x, ahead_y = x + _NUDGE * sign_x, y + _NUDGE * sign_y
+    for _ in range(steps):
+        j, i = jnp.floor(ahead_x + reach * dx), jnp.floor(ahead_y + reach * dy)
+        side = _at(flat, layer + (i * width + j).astype(jnp.int32)).astype(jnp.float32)
+        leave = jnp.minimum((j + edge_x + side * sign_x) * per_x, (i + edge_y + side * sign_y) * per_y)
+        reach = jnp.maximum(reach, leave)
+    return reach, side
+
+
+def _on_border(squares: Array, x: Array, y: Array, dx: Array, dy: Array, reach: Array) -> Array:
+    """Whether a ray that ended at ``reach`` ended outside of the map (not on an occupied cell)."""
+    height, width = squares.shape[1] - 2, squares.shape[2] - 2
+    j = x + reach * dx + jnp.where(dx >= 0, _NUDGE, -_NUDGE)
+    i = y + reach * dy + jnp.where(dy >= 0, _NUDGE, -_NUDGE)
+    return ~inside((height, width), i, j) | (i < 0) | (j < 0)
+
+
+def _first_walls(tables: MapTables, angles: int) -> Array:
+    """(H, W, A) int16 walls seen from cell centres: 2 * coordinate of the cell edge hit + (0 across x, 1 across y)."""
+    height, width = tables.grid.shape
+    theta = jnp.arange(angles) * (2 * jnp.pi / angles)
+    dx, dy = jnp.cos(theta), jnp.sin(theta)
+    limit = tables.range_max / tables.grid.resolution + 1.0
+
+    def one_row(i: Array) -> Array:
+        x, y = jnp.arange(width)[:, None] + 0.5, i + 0.5
+        reach = march(tables.squares, x, jnp.full((width, 1), y), *jnp.broadcast_arrays(dx, dy), limit)
+        at_x, at_y = x + reach * dx, y + reach * dy
+        across_y = jnp.abs(at_y - jnp.round(at_y)) < jnp.abs(at_x - jnp.round(at_x))
+        edge = jnp.round(jnp.where(across_y, at_y, at_x))
+        return jnp.where(jnp.isfinite(reach), 2 * edge + across_y, -1).astype(jnp.int16)
+
+    return jax.lax.map(one_row, jnp.arange(height), batch_size=16)
+
+
+def _meet_walls(walls: Array, x: Array, y: Array, theta: Array, bearings: Array) -> Array:
+    """Distance in cells along the actual rays to the tabulated wall, inf for none."""
+    height, width, angles = walls.shape
+    dx, dy = _directions(theta, bearings)
+    known = inside((height, width), y, x) & jnp.isfinite(theta)[..., None]
+    cell = jnp.where(known, jnp.floor(y) * width + jnp.floor(x), 0).astype(jnp.int32) * angles
+    turns = (theta[..., None] + bearings) * (angles / (2 * jnp.pi))
+    bins = jnp.round(jnp.where(known, turns, 0.0)).astype(jnp.int32) % angles
+    wall = _at(walls.reshape(-1), cell + bins).astype(jnp.int32)
+    across_y = (wall & 1) == 1
+    gap = (wall >> 1).astype(jnp.float32) - jnp.where(across_y, y, x)
+    reach = jnp.maximum(gap / jnp.where(across_y, dy, dx), 0.0)
+    return jnp.where(known & (wall >= 0), reach, jnp.inf)

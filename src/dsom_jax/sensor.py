@@ -1,0 +1,151 @@
+"""Observation models: the paper's Score (Eq 15), and true log-likelihoods of a scan.
+
+Ranges follow REP-117 throughout: +inf is a beam without return and is evidence, NaN and -inf are invalid and are not.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+
+from dsom_jax.geometry import transform_points
+from dsom_jax.lidar import LidarConfig, scan_points
+from dsom_jax.occupancy import OccupancyGrid, euclidean_distance
+from dsom_jax.types import Array
+
+
+@dataclass(frozen=True)
+class ScoreModel:
+    """Eq 15 of the paper.
+
+    Attributes:
+        sigma: standard deviation of a range, metres (the authors: 5 cells of 1/3 m).
+        alpha, beta: weights of the Gaussian and of the constant 1 / range_max.
+        range_max: L_max, metres.
+        power: exponent of each beam's term; 3 in the paper, 1 in the authors' code.
+    """
+
+    sigma: float = 5 / 3
+    alpha: float = 0.9
+    beta: float = 0.1
+    range_max: float = 10.0
+    power: int = 3
+
+
+def valid_beams(ranges: Array) -> Array:
+    """Which beams are evidence: finite or +inf."""
+    return ranges > -jnp.inf
+
+
+def range_difference(ranges: Array, expected: Array) -> Array:
+    """Observed minus expected; 0 where neither returns, +-inf where exactly one does."""
+    neither = jnp.isposinf(ranges) & jnp.isposinf(expected)
+    return jnp.where(neither, 0.0, ranges - jnp.where(neither, 0.0, expected))
+
+
+def beam_score(ranges: Array, expected: Array, model: ScoreModel) -> Array:
+    """Score(L_o, L_p) of Eq 15 for scans (..., B) in metres: (...)."""
+    difference = range_difference(ranges, expected)
+    gaussian = jnp.exp(-0.5 * (difference / model.sigma) ** 2) / (model.sigma * math.sqrt(2 * math.pi))
+    terms = (model.alpha * gaussian + model.beta / model.range_max) ** model.power
+    return jnp.where(valid_beams(ranges), terms, 0.0).sum(-1)
+
+
+def perfect_score(ranges: Array, model: ScoreModel) -> Array:
+    """w* = Score(L, L), the score of a scan (..., B) without any difference (appendix A of the paper)."""
+    best = model.alpha / (model.sigma * math.sqrt(2 * math.pi)) + model.beta / model.range_max
+    return valid_beams(ranges).sum(-1) * best**model.power
+
+
+@dataclass(frozen=True)
+class BeamModel:
+    """Tempered beam model (Probabilistic Robotics, table 6.1), per metre of range.
+
+    Attributes:
+        z_hit, z_short, z_max, z_rand: weights of the four causes of a reading; they sum to one.
+        sigma_hit: standard deviation of a hit, metres.
+        temper: factor on the log-likelihood, as neighbouring beams are not independent.
+        range_max: metres.
+    """
+
+    z_hit: float = 0.7
+    z_short: float = 0.15
+    z_max: float = 0.05
+    z_rand: float = 0.1
+    sigma_hit: float = 0.2
+    temper: float = 0.25
+    range_max: float = 10.0
+
+    def __post_init__(self) -> None:
+        if abs(self.z_hit + self.z_short + self.z_max + self.z_rand - 1) > 1e-6:
+            raise ValueError("BeamModel: z_hit + z_short + z_max + z_rand must be 1")
+        if self.sigma_hit <= 0 or self.temper <= 0:
+            raise ValueError("BeamModel: sigma_hit and temper must be positive")
+
+
+def beam_log_terms(ranges: Array, expected: Array, model: BeamModel) -> Array:
+    """Log-likelihood of each beam, shapes broadcast, untempered; 0 for invalid beams."""
+    no_return, no_wall = jnp.isposinf(ranges), jnp.isposinf(expected)
+    difference = jnp.where(no_return | no_wall, jnp.inf, ranges - jnp.where(no_wall, 0.0, expected))
+    hit = jnp.exp(-0.5 * (difference / model.sigma_hit) ** 2) / (model.sigma_hit * math.sqrt(2 * math.pi))
+    reach = jnp.minimum(expected, model.range_max)
+    short = jnp.where(ranges < reach, 1.0 / jnp.maximum(reach, model.sigma_hit), 0.0)
+    returned = model.z_hit * hit + model.z_short * short + model.z_rand / model.range_max
+    missing = jnp.where(no_wall, model.z_hit + model.z_max, model.z_max) + model.z_rand / model.range_max
+    return jnp.where(valid_beams(ranges), jnp.log(jnp.where(no_return, missing, returned)), 0.0)
+
+
+def beam_log_likelihood(ranges: Array, expected: Array, model: BeamModel) -> Array:
+    """Tempered log p(z | x) of scans (..., B) in metres: (...)."""
+    return model.temper * beam_log_terms(ranges, expected, model).sum(-1)
+
+
+@dataclass(frozen=True)
+class LikelihoodField:
+    """Tempered end-point model (Probabilistic Robotics, table 6.3; nav2 ``likelihood_field``).
+
+    Attributes:
+        z_hit, z_rand: weights; they sum to one.
+        sigma_hit: standard deviation of the distance to the nearest obstacle, metres.
+        max_distance: distances are cut here, metres (``laser_likelihood_max_dist``).
+        temper: factor on the log-likelihood.
+        range_max: metres.
+    """
+
+    z_hit: float = 0.9
+    z_rand: float = 0.1
+    sigma_hit: float = 0.2
+    max_distance: float = 2.0
+    temper: float = 0.25
+    range_max: float = 10.0
+
+
+def distance_field(grid: OccupancyGrid, model: LikelihoodField) -> Array:
+    """(H, W) metres from cell centres to the nearest occupied one, at most ``max_distance``."""
+    cap = max(1, math.ceil(model.max_distance / grid.resolution))
+    return jnp.minimum(euclidean_distance(grid.occupied, cap) * grid.resolution, model.max_distance)
+
+
+def interpolate(field: Array, i: Array, j: Array) -> Array:
+    """Bilinear value of ``field`` (H, W) at real-valued cell coordinates, edges extended."""
+    i, j = jnp.clip(i, 0, field.shape[0] - 1), jnp.clip(j, 0, field.shape[1] - 1)
+    i0, j0 = (jnp.floor(v).astype(jnp.int32) for v in (i, j))
+    i1, j1 = jnp.minimum(i0 + 1, field.shape[0] - 1), jnp.minimum(j0 + 1, field.shape[1] - 1)
+    di, dj = i - i0, j - j0
+    low = field[i0, j0] * (1 - dj) + field[i0, j1] * dj
+    high = field[i1, j0] * (1 - dj) + field[i1, j1] * dj
+    return low * (1 - di) + high * di
+
+
+def field_log_likelihood(
+    field: Array, grid: OccupancyGrid, poses: Array, ranges: Array, lidar: LidarConfig, model: LikelihoodField
+) -> Array:
+    """Tempered log p(z | x) (...) of one scan (B,) at poses (..., 3); beams without return say nothing here."""
+    points, valid = scan_points(ranges, lidar)
+    ends = transform_points(grid.to_grid(poses), points) / grid.resolution - 0.5
+    distance = interpolate(field, ends[..., 1], ends[..., 0])
+    density = jnp.exp(-0.5 * (distance / model.sigma_hit) ** 2) / (model.sigma_hit * math.sqrt(2 * math.pi))
+    terms = jnp.log(model.z_hit * density + model.z_rand / model.range_max)
+    return model.temper * jnp.where(valid, terms, 0.0).sum(-1)
