@@ -1,0 +1,167 @@
+"""Logs of CARMEN: FLASER (the robot-laser message of 2002-2005), ROBOTLASER1 (from 2006), RAWLASER1 or LASER with ODOM.
+
+One message a line, fields separated by blanks (CARMEN's readlog.c):
+
+    FLASER n r1..rn  laser_x laser_y laser_theta  odom_x odom_y odom_theta  stamp host logger_stamp
+    ROBOTLASER1 type start_angle fov resolution max_range accuracy remission_mode  n r1..rn  m e1..em
+        laser_x laser_y laser_theta  odom_x odom_y odom_theta  tv rv forward side turn  stamp host logger_stamp
+    RAWLASER1 type start_angle fov resolution max_range accuracy remission_mode  n r1..rn  m e1..em
+        stamp host logger_stamp
+    LASER n r1..rn  stamp host logger_stamp
+    ODOM x y theta tv rv accel  stamp host logger_stamp
+    PARAM name value ...
+
+The rear laser (RLASER, ROBOTLASER2, RAWLASER2) and other messages are left out. A line that cannot be read is counted.
+Only the odometry reaches a filter: the laser triple says where the laser is mounted if it follows the odometry rigidly,
+and is the reference trajectory, as SLAM programs write it, if it does not.
+"""
+
+from __future__ import annotations
+
+import gzip
+import re
+import zlib
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from dsom_jax.data import se2
+from dsom_jax.data.carmen_lidar import LaserConfig, guess_config, lidar_of
+from dsom_jax.data.files import read_bytes
+from dsom_jax.data.log import RawLog, Report, limit_ranges, majority_beams, rigid_mount, tidy
+from dsom_jax.data.odometry import odometry_at
+from dsom_jax.errors import UserError
+
+WITH_POSE = ("FLASER", "ROBOTLASER1")
+WITHOUT_POSE = ("RAWLASER1", "LASER")
+
+
+@dataclass
+class Messages:
+    """What the lines of a log say: one entry for each scan in ``ranges``, ``poses`` (laser, then odometry: (6,)) and
+    ``stamps``; ``odometry`` rows are (stamp, x, y, theta)."""
+
+    ranges: list[np.ndarray] = field(default_factory=list)
+    poses: list[np.ndarray] = field(default_factory=list)
+    stamps: list[float] = field(default_factory=list)
+    configs: list[LaserConfig] = field(default_factory=list)
+    odometry: list[np.ndarray] = field(default_factory=list)
+    params: dict[str, str] = field(default_factory=dict)
+    report: Report = field(default_factory=Report)
+
+
+def load_carmen(path: str | Path, range_max: float | None = None) -> RawLog:
+    """Scans, odometry and, where the log holds one, the reference of a ``.log``, ``.clf`` or ``.gz`` file.
+
+    Readings from ``range_max`` metres on are no returns. Without it the value comes from ``meta.yaml`` beside the log,
+    from the log's own messages, or is detected (see :func:`dsom_jax.data.carmen_lidar.detect_no_return`).
+    """
+    path = Path(path)
+    messages = parse(_lines(path))
+    if not messages.stamps:
+        raise UserError(
+            f"{path}: holds no FLASER, ROBOTLASER1 or RAWLASER1 line, so it is not a CARMEN log of a front laser"
+            + "".join(f"; {line}" for line in messages.report.lines()[:2])
+        )
+    keep = majority_beams(messages.ranges, messages.report, path)
+    ranges = np.stack([scan for scan, kept in zip(messages.ranges, keep, strict=True) if kept])
+    stamps = np.array(messages.stamps)[keep]
+    config = next(c for c, kept in zip(messages.configs, keep, strict=True) if kept)
+    odometry, mount, reference = _poses(messages, keep, stamps, path)
+    lidar = lidar_of(path, ranges, config, messages.params, mount, range_max)
+    if reference is not None:
+        reference = se2.compose(reference, se2.inverse(np.array(lidar.mount)))
+    ranges = limit_ranges(ranges, lidar.range_min, lidar.range_max)
+    return tidy(RawLog(ranges, odometry, stamps, lidar, reference, messages.report, path))
+
+
+def _lines(path: Path) -> list[str]:
+    """Text lines of a plain or gzipped file."""
+    content = read_bytes(path, "log")
+    if content[:2] == b"\x1f\x8b":
+        try:
+            content = gzip.decompress(content)
+        except (OSError, EOFError, zlib.error):
+            raise UserError(f"{path}: broken gzip file; copy or download it again") from None
+    return content.decode(errors="replace").splitlines()
+
+
+def parse(lines: list[str]) -> Messages:
+    """Messages of a log; what cannot be read is counted in the report."""
+    messages = Messages()
+    # Logs may hold the same scan raw and with the robot's pose: the one with the pose is enough.
+    present = {line.split(None, 1)[0] for line in lines if not line.isspace() and line}
+    wanted = next((kind for kind in WITH_POSE + WITHOUT_POSE if kind in present), None)
+    for number, line in enumerate(lines, start=1):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        try:
+            _message(messages, words, wanted)
+        except (ValueError, IndexError):
+            messages.report.add("unreadable lines skipped", f"line {number}: '{' '.join(words)[:40]}'")
+    return messages
+
+
+def _message(messages: Messages, words: list[str], wanted: str | None) -> None:
+    """Enter one line; ValueError or IndexError if it is malformed."""
+    kind = words[0]
+    if kind == wanted:
+        _scan(messages, words)
+    elif kind == "ODOM":
+        x, y, theta, *_, stamp = (float(w) for w in words[1:8])
+        if not np.isfinite([x, y, theta, stamp]).all() or len(words) < 8:
+            raise ValueError("odometry")
+        messages.odometry.append(np.array([stamp, x, y, theta]))
+    elif kind == "PARAM":
+        messages.params[words[1]] = words[2]
+    elif re.fullmatch("[A-Z][A-Z0-9_]*", kind):
+        messages.report.add(f"{kind} messages not used")
+    else:
+        raise ValueError("not a message")
+
+
+def _scan(messages: Messages, words: list[str]) -> None:
+    """Enter a laser message of any of the four forms."""
+    kind = words[0]
+    config, rest = (None, words[1:]) if kind in ("FLASER", "LASER") else (_config(words), words[8:])
+    count = int(rest[0])
+    if not 0 < count < len(rest):
+        raise ValueError("number of readings")
+    ranges, rest = np.array([float(w) for w in rest[1 : count + 1]]), rest[count + 1 :]
+    if config is not None:
+        rest = rest[int(rest[0]) + 1 :]
+    poses = np.array(rest[:6] if kind in WITH_POSE else [np.nan] * 6, float)
+    skip = {"FLASER": 6, "ROBOTLASER1": 11}.get(kind, 0)
+    stamp = float(rest[skip])
+    if len(rest) > skip + 3:
+        raise ValueError("more fields than readings and poses account for")
+    if (kind in WITH_POSE and not np.isfinite(poses).all()) or not np.isfinite(stamp):
+        raise ValueError("poses and stamp")
+    messages.ranges.append(ranges)
+    messages.poses.append(poses)
+    messages.stamps.append(stamp)
+    messages.configs.append(config or guess_config(count))
+
+
+def _config(words: list[str]) -> LaserConfig:
+    """Geometry that a message of 2006 and later carries."""
+    start, _, resolution, maximum = (float(w) for w in words[2:6])
+    if not np.isfinite([start, resolution]).all():
+        raise ValueError("angles")
+    return LaserConfig(start, resolution, maximum)
+
+
+def _poses(
+    messages: Messages, keep: np.ndarray, stamps: np.ndarray, path: Path
+) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
+    """Odometry (N, 3) at the scans, the mount (3,) if the log tells it, and the corrected poses of the laser (N, 3)."""
+    poses = np.array(messages.poses)[keep]
+    if np.isfinite(poses).all():
+        laser, odometry = poses[:, :3], poses[:, 3:]
+        mount = rigid_mount(odometry, laser)
+        return odometry, mount, laser if mount is None else None
+    if len(messages.odometry) < 2:
+        raise UserError(f"{path}: neither its laser messages nor ODOM lines give odometry; give a log with both")
+    return odometry_at(np.array(messages.odometry), stamps, messages.report), None, None

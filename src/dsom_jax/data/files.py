@@ -1,0 +1,51 @@
+"""Reading and writing whole files: clear errors, nothing half-written."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from dsom_jax.errors import UserError
+
+
+def read_bytes(path: str | Path, what: str) -> bytes:
+    """Content of a file; ``what`` names its role in the error."""
+    try:
+        return Path(path).read_bytes()
+    except FileNotFoundError:
+        raise UserError(f"{path}: no such {what}; check the path") from None
+    except IsADirectoryError:
+        raise UserError(f"{path}: is a directory, not a {what}; give the file itself") from None
+    except OSError as error:
+        raise UserError(f"{path}: cannot read the {what} ({error.strerror}); check its permissions") from None
+
+
+def read_yaml(path: str | Path, what: str) -> dict[str, Any]:
+    """Mapping stored in a YAML file."""
+    try:
+        document = yaml.safe_load(read_bytes(path, what))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f" at line {mark.line + 1}" if mark else ""
+        raise UserError(f"{path}: not valid YAML{where}; the {what} must be a list of 'field: value' lines") from None
+    if not isinstance(document, Mapping):
+        raise UserError(f"{path}: holds no fields; the {what} must be a list of 'field: value' lines")
+    return {str(key): value for key, value in document.items()}
+
+
+def write_atomic(path: str | Path, content: bytes) -> None:
+    """Write a file so that it is either complete or not there; its folder is made where needed."""
+    path = Path(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as file:
+            file.write(content)
+        os.chmod(file.name, 0o644)
+        os.replace(file.name, path)
+    except OSError as error:
+        raise UserError(f"{path}: cannot be written ({error.strerror}); choose another output folder") from None

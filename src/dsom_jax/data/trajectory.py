@@ -1,0 +1,102 @@
+"""Trajectories as TUM text: ``stamp x y z qx qy qz qw`` a line, seconds and metres; poses here are (x, y, yaw)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from dsom_jax.data import se2
+from dsom_jax.data.files import read_bytes, write_atomic
+from dsom_jax.data.log import RawLog
+from dsom_jax.errors import UserError
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Timed poses.
+
+    Attributes:
+        stamps: (N,) float64 seconds, ascending.
+        poses: (N, 3) float64 (m, m, rad).
+    """
+
+    stamps: np.ndarray
+    poses: np.ndarray
+
+
+def yaw_of(quaternion: np.ndarray) -> np.ndarray:
+    """Heading (...) of quaternions (..., 4) = (x, y, z, w), radians; roll and pitch do not matter."""
+    x, y, z, w = np.moveaxis(np.asarray(quaternion, float), -1, 0)
+    # Written so that the quaternion need not be normalised.
+    return np.arctan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)
+
+
+def load_tum(path: str | Path) -> Trajectory:
+    """Trajectory of a TUM file; comments and empty lines are skipped, rows are sorted by stamp."""
+    rows = []
+    for number, line in enumerate(read_bytes(path, "trajectory").decode(errors="replace").splitlines(), start=1):
+        words = line.split("#")[0].replace(",", " ").split()
+        if words:
+            rows.append(_row(path, number, words))
+    if not rows:
+        raise UserError(f"{path}: holds no pose; each line must be 'stamp x y z qx qy qz qw'")
+    table = np.array(rows)
+    table = table[np.argsort(table[:, 0], kind="stable")]
+    return Trajectory(table[:, 0], np.column_stack([table[:, 1:3], yaw_of(table[:, 4:8])]))
+
+
+def _row(path: str | Path, number: int, words: list[str]) -> list[float]:
+    """The eight numbers of a line."""
+    try:
+        row = [float(word) for word in words]
+    except ValueError:
+        row = []
+    if len(row) != 8 or not np.isfinite(row).all() or not any(row[4:]):
+        raise UserError(f"{path}: line {number}: must be 'stamp x y z qx qy qz qw' with a quaternion that is not zero")
+    return row
+
+
+def save_tum(path: str | Path, stamps: np.ndarray, poses: np.ndarray) -> None:
+    """Write poses (N, 3) at ``stamps`` (N,) atomically; nanoseconds and micrometres are kept."""
+    rows = (
+        f"{t:.9f} {x:.6f} {y:.6f} 0 0 0 {np.sin(yaw / 2):.9f} {np.cos(yaw / 2):.9f}\n"
+        for t, (x, y, yaw) in zip(np.asarray(stamps, float), np.asarray(poses, float), strict=True)
+    )
+    write_atomic(path, "".join(rows).encode())
+
+
+def associate(trajectory: Trajectory, stamps: np.ndarray, tolerance: float = 0.01, max_gap: float = 1.0) -> np.ndarray:
+    """Poses (M, 3) of a trajectory at ``stamps`` (M,), NaN where it does not tell.
+
+    The pose of the nearest stamp within ``tolerance`` seconds; failing that, the interpolation between the neighbours
+    if they are at most ``max_gap`` seconds apart.
+    """
+    stamps = np.asarray(stamps, float)
+    after = np.clip(np.searchsorted(trajectory.stamps, stamps), 1, max(len(trajectory.stamps) - 1, 1))
+    after = np.minimum(after, len(trajectory.stamps) - 1)
+    before = np.maximum(after - 1, 0)
+    near_before = np.abs(stamps - trajectory.stamps[before]) <= np.abs(trajectory.stamps[after] - stamps)
+    nearest = np.where(near_before, before, after)
+    close = np.abs(trajectory.stamps[nearest] - stamps) <= tolerance
+    between = (trajectory.stamps[before] <= stamps) & (stamps <= trajectory.stamps[after])
+    bridged = between & (trajectory.stamps[after] - trajectory.stamps[before] <= max_gap)
+    poses = np.where(bridged[:, None], se2.interpolate(trajectory.stamps, trajectory.poses, stamps), np.nan)
+    return np.where(close[:, None], trajectory.poses[nearest], poses)
+
+
+def with_reference(log: RawLog, path: str | Path, tolerance: float = 0.01, max_gap: float = 1.0) -> RawLog:
+    """The log with the reference trajectory of a TUM file; it is an error if no scan finds its pose."""
+    trajectory = load_tum(path)
+    poses = associate(trajectory, log.stamps, tolerance, max_gap)
+    missing = int(np.isnan(poses).any(-1).sum())
+    if missing == len(log):
+        raise UserError(
+            f"{path}: no pose within {tolerance} s of any scan: it covers {trajectory.stamps[0]:.3f} to "
+            f"{trajectory.stamps[-1]:.3f} s, {log.path} covers {log.stamps.min():.3f} to {log.stamps.max():.3f} s; "
+            "both must use the same clock"
+        )
+    if missing:
+        log.report.add("scans without a reference pose", count=missing)
+    return replace(log, reference=poses)
