@@ -41,9 +41,7 @@ def test_round_trip_and_evo_reads_the_same(tmp_path: Path) -> None:
     np.testing.assert_allclose(se2.wrap(mine.poses[:, 2] - yaw), 0, atol=1e-8)
 
 
-@given(
-    yaw=st.floats(-3.1, 3.1), pitch=st.floats(-1.5, 1.5), roll=st.floats(-3.1, 3.1), scale=st.floats(0.1, 10)
-)
+@given(yaw=st.floats(-3.1, 3.1), pitch=st.floats(-1.5, 1.5), roll=st.floats(-3.1, 3.1), scale=st.floats(0.1, 10))
 @settings(max_examples=60, deadline=None)
 def test_yaw_of_tilted_quaternions(yaw: float, pitch: float, roll: float, scale: float) -> None:
     quaternion = scale * Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_quat()
@@ -117,6 +115,10 @@ def test_missing_and_unwritable(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match="cannot be written"):
         save_tum(tmp_path / "file" / "a.tum", np.zeros(1), np.zeros((1, 3)))
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(UserError, match="cannot be written"):
+        save_tum(tmp_path / "folder", np.zeros(1), np.zeros((1, 3)))
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "folder"]
 
 
 def test_a_reference_in_another_clock_is_an_error(tmp_path: Path) -> None:

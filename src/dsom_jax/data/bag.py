@@ -15,7 +15,9 @@ from dsom_jax.data.tf_tree import TfTree, planar
 from dsom_jax.errors import UserError
 from dsom_jax.lidar import LidarConfig
 
-SCAN, ODOMETRY, TF = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage"
+SCAN, ODOMETRY = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Odometry"
+TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+"""The second is the name of the same message in bags from before 2013."""
 
 
 def load_bag(
@@ -88,7 +90,7 @@ def _choose(path: Path, topics: dict[str, str], kind: str, wanted: str | None, a
 
 def _read(reader: Any, scan_topic: str, odom_topic: str | None, report: Report) -> tuple[list[Any], list[Any], TfTree]:
     """Scans and odometry messages in recording order, and the transforms."""
-    wanted = [c for c in reader.connections if c.topic in (scan_topic, odom_topic) or c.msgtype == TF]
+    wanted = [c for c in reader.connections if c.topic in (scan_topic, odom_topic) or c.msgtype in TF]
     scans: list[Any] = []
     odometry: list[Any] = []
     tree = TfTree()

@@ -43,9 +43,9 @@ def write_atomic(path: str | Path, content: bytes) -> None:
     path = Path(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as file:
-            file.write(content)
-        os.chmod(file.name, 0o644)
-        os.replace(file.name, path)
+        with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:
+            whole = Path(folder) / "whole"
+            whole.write_bytes(content)
+            os.replace(whole, path)
     except OSError as error:
         raise UserError(f"{path}: cannot be written ({error.strerror}); choose another output folder") from None

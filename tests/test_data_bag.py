@@ -1,0 +1,148 @@
+"""Bags of the three formats, written here: topics, mounts, interpolation, and what can be wrong with them."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dsom_jax.data import load_bag, load_log, se2
+from dsom_jax.errors import UserError
+from fixtures.make_bag import FORMATS, Entry, write_bag
+
+RANGES = (0.05, 0.0, 1.0, 7.5, 8.0, 9.0, np.inf, np.nan)
+
+
+def drive(
+    n: int = 5, scan_topic: str = "/scan", odom_topic: str = "/odom", mount: tuple = (0.2, 0.1, 0.5)
+) -> list[Entry]:
+    """Scans half way between odometry messages of 1 m and 0.4 rad each 0.2 s, over the wrap of the heading."""
+    out: list[Entry] = [(10.0, "/tf_static", "tf", ("base_link", "laser", *mount))] if mount else []
+    for k in range(n):
+        t = 10.0 + 0.2 * k
+        out.append((t, odom_topic, "odom", (float(k), 2.0, float(se2.wrap(3.0 + 0.4 * k)))))
+        out.append((t + 0.1, scan_topic, "scan", (RANGES,)))
+    return out
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_every_format(tmp_path: Path, form: str) -> None:
+    log = load_bag(write_bag(tmp_path, form, drive()))
+    np.testing.assert_allclose(log.stamps, 10.1 + 0.2 * np.arange(5), atol=1e-9)
+    # REP-117: too close, zero is an error code, returns, from range_max on no return.
+    expected = [-np.inf, np.nan, 1.0, 7.5, np.inf, np.inf, np.inf, np.nan]
+    np.testing.assert_array_equal(log.ranges, np.tile(np.float32(expected), (5, 1)))
+    # The last scan is 0.1 s after the last odometry, which is close enough to stand for it.
+    np.testing.assert_allclose(log.odometry[:, 0], [0.5, 1.5, 2.5, 3.5, 4.0], atol=1e-6)
+    np.testing.assert_allclose(se2.wrap(log.odometry[:4, 2] - 3.2 - 0.4 * np.arange(4)), 0, atol=1e-6)
+    assert (log.lidar.beams, log.lidar.angle_min, log.lidar.angle_increment) == (8, -1.0, 0.5)
+    assert log.lidar.range_max == 8.0 and log.lidar.range_min == pytest.approx(0.1)
+    np.testing.assert_allclose(log.lidar.mount, [0.2, 0.1, 0.5], atol=1e-9)
+    assert not log.lidar.upside_down and log.reference is None
+
+
+@pytest.mark.parametrize("form", ["db3", "mcap"])
+def test_storage_file_without_its_folder(tmp_path: Path, form: str) -> None:
+    folder = write_bag(tmp_path, form, drive())
+    (storage,) = folder.glob(f"*.{form}")
+    alone = tmp_path / f"alone.{form}"
+    shutil.copy(storage, alone)
+    np.testing.assert_array_equal(load_log(alone).ranges, load_log(folder).ranges)
+
+
+def test_upside_down_laser_through_a_chain_of_frames(tmp_path: Path) -> None:
+    entries = drive(mount=())
+    # base_link is a child of the frame that odometry moves; the laser hangs on a mast, head down and turned.
+    static = [
+        (10.0, "/tf_static", "tf", ("base_footprint", "base_link", 0.0, 0.0, 0.0)),
+        (10.0, "/tf_static", "tf", ("/base_link", "/mast", 0.3, 0.0, np.pi / 2)),
+        (10.0, "/tf_static", "tf", ("mast", "laser", 0.1, 0.0, 0.25, np.pi)),
+    ]
+    moved = [(t, topic, kind, (*v, "base_footprint") if kind == "odom" else v) for t, topic, kind, v in entries]
+    lidar = load_bag(write_bag(tmp_path, "bag", static + moved)).lidar
+    assert lidar.upside_down
+    np.testing.assert_allclose(lidar.mount, [0.3, 0.1, np.pi / 2 + 0.25], atol=1e-6)
+    # A beam to the sensor's left (+1 rad) of a laser head down points to the right of its forward direction.
+    beam = int(np.argmin(np.abs(lidar.angle_min + lidar.angle_increment * np.arange(8) - 1.0)))
+    assert lidar.angles()[beam] == pytest.approx(np.pi / 2 + 0.25 - 1.0, abs=1e-6)
+
+
+def test_missing_mount_and_tilt_are_reported(tmp_path: Path) -> None:
+    log = load_bag(write_bag(tmp_path, "bag", drive(mount=())))
+    assert log.lidar.mount == (0, 0, 0) and any("missing transform base_link -> laser" in s for s in log.report.lines())
+    tilted = load_bag(write_bag(tmp_path, "db3", drive(mount=(0.0, 0.0, 0.0, 0.5))))
+    assert any("tilted by 29 deg" in line for line in tilted.report.lines())
+
+
+def test_odometry_from_tf_where_there_is_no_topic(tmp_path: Path) -> None:
+    entries = [
+        (t, "/tf", "tf", ("odom", "base_link", *v)) if kind == "odom" else (t, topic, kind, v)
+        for t, topic, kind, v in drive()
+    ]
+    log = load_bag(write_bag(tmp_path, "bag", entries))
+    np.testing.assert_allclose(log.odometry[:4, 0], [0.5, 1.5, 2.5, 3.5], atol=1e-6)
+    np.testing.assert_allclose(log.lidar.mount, [0.2, 0.1, 0.5], atol=1e-9)
+
+
+def test_topics_must_be_chosen_where_there_are_several(tmp_path: Path) -> None:
+    entries = [*drive(), (11.1, "/rear", "scan", ((1.0, 2.0),)), (11.1, "/visual_odom", "odom", (0.0, 0.0, 0.0))]
+    path = write_bag(tmp_path, "bag", entries)
+    with pytest.raises(UserError, match=r"several sensor_msgs/LaserScan topics; set scan_topic to one of /rear, /scan"):
+        load_bag(path)
+    with pytest.raises(UserError, match=r"several nav_msgs/Odometry topics; set odom_topic"):
+        load_bag(path, scan_topic="/scan")
+    assert len(load_bag(path, scan_topic="/scan", odom_topic="/odom")) == 5
+    with pytest.raises(UserError, match=r"scan_topic = /lidar: no such .* /odom \(nav_msgs/msg/Odometry\), /rear"):
+        load_bag(path, scan_topic="/lidar", odom_topic="/odom")
+
+
+def test_missing_topics(tmp_path: Path) -> None:
+    for k, (kinds, message) in enumerate(
+        [
+            (("odom", "tf"), "holds no sensor_msgs/LaserScan topic; topics in the bag: /odom"),
+            (("scan",), "holds no odometry"),
+        ]
+    ):
+        (tmp_path / str(k)).mkdir()
+        path = write_bag(tmp_path / str(k), "bag", [e for e in drive() if e[2] in kinds])
+        with pytest.raises(UserError, match=message):
+            load_bag(path)
+
+
+def test_scans_far_from_odometry_and_of_other_size_are_dropped(tmp_path: Path) -> None:
+    entries = [*drive(), (11.15, "/scan", "scan", ((1.0, 2.0),)), (15.0, "/scan", "scan", (RANGES,))]
+    log = load_bag(write_bag(tmp_path, "bag", entries))
+    assert len(log) == 5
+    assert log.report.counts["scans without odometry near their stamp"] == 1
+    assert log.report.counts["scans of 2 beams dropped, the log's lidar has 8"] == 1
+
+
+def test_range_max_override(tmp_path: Path) -> None:
+    log = load_bag(write_bag(tmp_path, "bag", drive()), range_max=5.0)
+    assert log.lidar.range_max == 5.0 and np.isposinf(log.ranges[:, 3]).all()
+
+
+@pytest.mark.parametrize("name", ["a.bag", "a.db3", "a.mcap"])
+@pytest.mark.parametrize("content", [b"", b"not a bag at all, whatever its name says"])
+def test_broken_bags(tmp_path: Path, name: str, content: bytes) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(UserError, match=f"{name}: not a readable bag") as error:
+        load_bag(tmp_path / name)
+    assert "\n" not in str(error.value)
+
+
+def test_a_bag_cut_off(tmp_path: Path) -> None:
+    path = write_bag(tmp_path, "bag", drive(n=50))
+    path.write_bytes(path.read_bytes()[:3000])
+    with pytest.raises(UserError, match="not a readable bag"):
+        load_bag(path)
+
+
+def test_without_rosbags_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_bag(tmp_path, "bag", drive())
+    monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
+    with pytest.raises(UserError, match=r"pip install 'dsom-jax\[bags\]'"):
+        load_bag(path)
