@@ -1,1 +1,1 @@
-
+"""Simulated buildings, obstacles and drives."""
