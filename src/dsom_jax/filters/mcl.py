@@ -1,0 +1,57 @@
+"""MCL with random injection (Probabilistic Robotics, table 8.2 with a fixed injection rate)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dsom_jax.filters.common import Info, ParticleState
+from dsom_jax.filters.updates import Draw, FilterConfig, World, mcl_update, mix, start
+from dsom_jax.types import Inputs, Key
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class MCL:
+    """Sampling, weighting, resampling; a share ``injection`` of the particles is drawn anew from free space.
+
+    Attributes:
+        world: map and models.
+        config: particles and resampling (static).
+        injection: share of random particles at every update, 0.2 in the paper (static).
+    """
+
+    world: World
+    config: FilterConfig = field(metadata={"static": True})
+    injection: float = field(default=0.2, metadata={"static": True})
+
+    def prepare(self, inputs: Inputs) -> None:
+        """Nothing is shared between particles."""
+        return None
+
+    def init(self, key: Key) -> ParticleState:
+        """Uniform particles."""
+        return start(key, self.world, self.config)
+
+    def step(self, key: Key, state: ParticleState, inputs: Inputs, prepared: None) -> tuple[ParticleState, Info]:
+        """One update."""
+        _, k_update = jax.random.split(key)
+        k_high, k_low, k_spare = jax.random.split(k_update, 3)
+        everyone = jnp.ones(self.config.particles, bool)
+        moved = mcl_update(k_high, state, everyone, inputs, self.world, self.config)
+        moved = self._inject(k_low, moved, inputs)
+        spare, _ = self.world.space.sample(k_spare, None, self.config.particles)
+        return mix(state, everyone, moved, moved, spare)
+
+    def _inject(self, key: Key, draw: Draw, inputs: Inputs) -> Draw:
+        """Random particles in place of evenly spaced ones (neighbours in the set share an ancestor)."""
+        count = round(self.injection * self.config.particles)
+        if count == 0:
+            return draw
+        slots = np.linspace(0, self.config.particles, count, endpoint=False).astype(np.int32)
+        fresh, _ = self.world.space.sample(key, None, count)
+        weights = self.world.weigh(fresh, inputs.ranges)
+        return Draw(draw.poses.at[slots].set(fresh), draw.weights.at[slots].set(weights))

@@ -1,0 +1,135 @@
+"""From a name and a map to a filter: every combination that benchmarks and command lines offer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import jax
+
+from dsom_jax.episode import Episode
+from dsom_jax.filters.adam import AdamMCL
+from dsom_jax.filters.adam_robust import AdamRobust, RobustConfig
+from dsom_jax.filters.mcl import MCL
+from dsom_jax.filters.mixture import MixtureMCL
+from dsom_jax.filters.updates import FilterConfig, World
+from dsom_jax.lidar import LidarConfig
+from dsom_jax.motion import OdometryMotion
+from dsom_jax.occupancy import OccupancyGrid
+from dsom_jax.proposals.dsom import dsom
+from dsom_jax.proposals.dual_features import DualFeaturesConfig, dual_features, with_episode
+from dsom_jax.proposals.likelihood_grid import LikelihoodGridConfig, likelihood_grid
+from dsom_jax.proposals.uniform import free_space
+from dsom_jax.raycast import RaycastConfig, make_tables
+from dsom_jax.sensor import BeamModel, ScoreModel
+from dsom_jax.types import Filter, Motion, Proposal
+
+Algorithm = Literal["mcl", "mixture_mcl", "adam", "adam_robust"]
+
+COMBINATIONS: dict[str, tuple[Algorithm, str]] = {
+    "mcl": ("mcl", "uniform"),
+    "mixture_mcl": ("mixture_mcl", "dual_features"),
+    "mixture_mcl_star": ("mixture_mcl", "dual_features_star"),
+    "mixture_mcl_dsom": ("mixture_mcl", "dsom"),
+    "adam_dsom": ("adam", "dsom"),
+    "adam_likelihood_grid": ("adam", "likelihood_grid"),
+    "robust_dsom": ("adam_robust", "dsom"),
+    "robust_likelihood_grid": ("adam_robust", "likelihood_grid"),
+}
+METHODS: tuple[str, ...] = tuple(COMBINATIONS)
+
+
+def needs_checkpoint(method: str) -> bool:
+    """Whether a method of :data:`METHODS` draws from a trained network."""
+    return COMBINATIONS[method][1] == "dsom"
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What all filters of a comparison share.
+
+    Attributes:
+        particles: N.
+        t_cut: T_cut of Alg 1.
+        max_beams: beams used for weighing.
+        motion: model of the drive.
+        score: Eq 15, for the paper's filters.
+        beam: true log-likelihood, for AdaM robust.
+        grid: the likelihood grid.
+        robust: AdaM robust; its particles, beams and model are those above.
+        raycast: how the paper's filters get expected ranges.
+        robust_raycast: how AdaM robust gets them.
+        seed: of what is random while a filter is built (the samples of Mixture MCL).
+    """
+
+    particles: int = 200
+    t_cut: float = 0.6
+    max_beams: int = 72
+    motion: Motion = OdometryMotion()
+    score: ScoreModel = ScoreModel()
+    beam: BeamModel = BeamModel(sigma_hit=0.2, temper=0.2)
+    grid: LikelihoodGridConfig = LikelihoodGridConfig()
+    robust: RobustConfig = RobustConfig()
+    raycast: RaycastConfig = RaycastConfig("table")
+    robust_raycast: RaycastConfig = RaycastConfig("exact")
+    seed: int = 0
+
+
+def build_filter(
+    name: str,
+    grid: OccupancyGrid,
+    lidar: LidarConfig,
+    *,
+    particles: int,
+    t_cut: float,
+    episode: Episode | None = None,
+    checkpoint: Any = None,
+) -> Filter:
+    """Filter ``name`` of :data:`METHODS` as the benchmark runs it.
+
+    ``episode`` is needed by ``mixture_mcl_star`` only; ``checkpoint`` is an evaluation view of a DSOM.
+    """
+    algorithm, proposal = COMBINATIONS[name]
+    settings = Settings(particles=particles, t_cut=t_cut)
+    return make_filter(algorithm, make_proposal(proposal, grid, lidar, settings, episode, checkpoint), grid, lidar, settings)
+
+
+def make_proposal(
+    name: str,
+    grid: OccupancyGrid,
+    lidar: LidarConfig,
+    settings: Settings,
+    episode: Episode | None = None,
+    checkpoint: Any = None,
+) -> Proposal:
+    """Proposal ``name`` on a map."""
+    if name == "uniform":
+        return free_space(grid)
+    if name == "likelihood_grid":
+        return likelihood_grid(grid, lidar, replace(settings.grid, model=replace(settings.grid.model, range_max=lidar.range_max)))
+    if name == "dsom":
+        return dsom(checkpoint, grid, lidar)
+    collected = dual_features(jax.random.key(settings.seed), grid, lidar, DualFeaturesConfig())
+    return collected if name == "dual_features" else with_episode(collected, episode)
+
+
+def make_filter(
+    algorithm: Algorithm, proposal: Proposal, grid: OccupancyGrid, lidar: LidarConfig, settings: Settings
+) -> Filter:
+    """Filter ``algorithm`` drawing from ``proposal``."""
+    step = -(-lidar.beams // settings.max_beams)
+    used = lidar.every(step)
+    if algorithm == "adam_robust":
+        model = replace(settings.beam, range_max=lidar.range_max)
+        config = replace(settings.robust, particles=settings.particles, beam_step=step, model=model)
+        tables = make_tables(grid, settings.robust_raycast, lidar.range_max)
+        return AdamRobust(tables, free_space(grid), proposal, used, settings.motion, config)
+    score = replace(settings.score, range_max=lidar.range_max)
+    tables = make_tables(grid, settings.raycast, lidar.range_max)
+    world = World(tables, free_space(grid), used, step, settings.motion, score)
+    config = FilterConfig(settings.particles)
+    if algorithm == "mcl":
+        return MCL(world, config)
+    if algorithm == "mixture_mcl":
+        return MixtureMCL(world, proposal, config)
+    return AdamMCL(world, proposal, config, settings.t_cut)

@@ -1,0 +1,185 @@
+"""The two updates that Alg 1 mixes: MCL for trusted particles, dual MCL for the rest; sizes vary, shapes do not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from dsom_jax.filters.common import Info, ParticleState, describe, normalise
+from dsom_jax.geometry import wrap_angle
+from dsom_jax.lidar import LidarConfig
+from dsom_jax.proposals.uniform import FreeSpace
+from dsom_jax.raycast import MapTables, cast_rays
+from dsom_jax.resampling import Resampling, pick
+from dsom_jax.sensor import ScoreModel, beam_score, perfect_score
+from dsom_jax.types import Array, Inputs, Key, Motion, Proposal
+
+Predecessor = Literal["knn", "motion"]
+_NEIGHBOURS = 3
+
+
+@dataclass(frozen=True)
+class FilterConfig:
+    """Choices of a Score-weighted filter (static).
+
+    Attributes:
+        particles: N.
+        predecessor: how dual MCL finds the particle whose weight a redrawn one inherits: ``knn`` draws from the three
+            nearest moved particles by inverse distance (the authors' way), ``motion`` by p(l' | a, l).
+        resampling: scheme for the MCL part.
+    """
+
+    particles: int = 200
+    predecessor: Predecessor = "knn"
+    resampling: Resampling = "systematic"
+
+    def __post_init__(self) -> None:
+        if self.particles < 1:
+            raise ValueError(f"particles = {self.particles}: give at least one")
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class World:
+    """What a filter knows: the map and the models of robot and sensor.
+
+    Attributes:
+        tables: the map.
+        space: uniform distribution over its free poses.
+        lidar: beams that are used (static); ``beam_step`` of the scan's beams are skipped between them (static).
+        motion, score: models (static).
+    """
+
+    tables: MapTables
+    space: FreeSpace
+    lidar: LidarConfig = field(metadata={"static": True})
+    beam_step: int = field(metadata={"static": True})
+    motion: Motion = field(metadata={"static": True})
+    score: ScoreModel = field(metadata={"static": True})
+
+    def weigh(self, poses: Array, ranges: Array) -> Array:
+        """w = p(o | s) by Eq 15 for poses (N, 3), in units of w*; one if no beam of the scan is valid."""
+        seen = ranges[:: self.beam_step]
+        best = perfect_score(seen, self.score)
+        score = beam_score(seen, cast_rays(self.tables, poses, self.lidar), self.score)
+        return jnp.where(best > 0, score / jnp.where(best > 0, best, 1.0), 1.0)
+
+
+class Draw(NamedTuple):
+    """Poses (N, 3) and raw weights (N,) of one branch."""
+
+    poses: Array
+    weights: Array
+
+
+def start(key: Key, world: World, config: FilterConfig) -> ParticleState:
+    """Uniform particles over free space: no prior."""
+    poses, _ = world.space.sample(key, None, config.particles)
+    even = jnp.full((config.particles,), 1.0 / config.particles)
+    return ParticleState(poses, jnp.zeros(config.particles), even, jnp.int32(0))
+
+
+def masked_ancestors(key: Key, normalised: Array, member: Array, method: Resampling) -> Array:
+    """(N,) ancestors drawn by w_norm among ``member`` (N,) only, one stratum for each member's slot."""
+    cumulative = jnp.cumsum(jnp.where(member, normalised, 0.0))
+    if method == "multinomial":
+        return pick(cumulative, jax.random.uniform(key, member.shape))
+    count = jnp.maximum(member.sum(), 1)
+    rank = jnp.cumsum(member) - member
+    return pick(cumulative, (rank % count + jax.random.uniform(key)) / count)
+
+
+def mcl_update(
+    key: Key, state: ParticleState, member: Array, inputs: Inputs, world: World, config: FilterConfig
+) -> Draw:
+    """Sample h from H by w_norm, move it, weigh it (Alg 1, lines 10 to 14)."""
+    k_resample, k_move = jax.random.split(key)
+    ancestors = masked_ancestors(k_resample, state.normalised, member, config.resampling)
+    poses = world.motion.sample(k_move, state.poses[ancestors], inputs.odometry)
+    return Draw(poses, world.weigh(poses, inputs.ranges))
+
+
+def dual_update(
+    key: Key,
+    state: ParticleState,
+    inputs: Inputs,
+    world: World,
+    proposal: Proposal,
+    prepared: Any,
+    config: FilterConfig,
+) -> Draw:
+    """Sample l' from PM and give it the weight of a predecessor (Alg 1, lines 15 to 19)."""
+    k_draw, k_move, k_match = jax.random.split(key, 3)
+    poses, _ = proposal.sample(k_draw, prepared, config.particles)
+    if config.predecessor == "motion":
+        log_match = world.motion.log_prob(poses[:, None], state.poses, inputs.odometry)
+        parents = _by_motion(k_match, log_match)
+    else:
+        parents = _by_distance(k_match, poses, world.motion.sample(k_move, state.poses, inputs.odometry))
+    return Draw(poses, state.weights[parents])
+
+
+def _by_motion(key: Key, log_match: Array) -> Array:
+    """One index per row of log p(l' | a, l) (N', N), by its exponential."""
+    match = jnp.exp(log_match - log_match.max(-1, keepdims=True))
+    return jax.vmap(pick)(jnp.cumsum(match, -1), jax.random.uniform(key, log_match.shape[:1]))
+
+
+def _by_distance(key: Key, poses: Array, moved: Array) -> Array:
+    """One of the three ``moved`` particles (N, 3) nearest to each of ``poses`` (N', 3), by inverse distance."""
+    count = min(_NEIGHBOURS, moved.shape[0])
+    squared, index = _nearest(poses, moved, count)
+    closeness = 1.0 / (jnp.sqrt(squared) + 1e-6)
+    chosen = jax.vmap(pick)(jnp.cumsum(closeness, -1), jax.random.uniform(key, poses.shape[:1]))
+    return jnp.take_along_axis(index, chosen[:, None], 1)[:, 0]
+
+
+def _nearest(poses: Array, others: Array, count: int) -> tuple[Array, Array]:
+    """Squared distances in (x, y, theta) and indices (N', count) of the nearest ``others``.
+
+    The index replaces the lowest bits of the distance, so that each neighbour is one vectorised minimum.
+    """
+    gap = poses[:, None] - others
+    squared = gap[..., 0] ** 2 + gap[..., 1] ** 2 + wrap_angle(gap[..., 2]) ** 2
+    bits = max(1, (others.shape[0] - 1).bit_length())
+    low = (1 << bits) - 1
+    keys = (jax.lax.bitcast_convert_type(squared, jnp.int32) & ~low) | jnp.arange(others.shape[0], dtype=jnp.int32)
+    found = [keys.min(-1)]
+    for _ in range(count - 1):
+        found.append(jnp.where(keys > found[-1][:, None], keys, jnp.iinfo(jnp.int32).max).min(-1))
+    best = jnp.stack(found, -1)
+    return jax.lax.bitcast_convert_type(best & ~low, jnp.float32), best & low
+
+
+def mix(state: ParticleState, high: Array, trusted: Draw, redrawn: Draw, spare: Array) -> tuple[ParticleState, Info]:
+    """P_t of the two branches; if every weight has vanished, the poses ``spare`` (N, 3) take over (flagged in Info)."""
+    poses = jnp.where(high[:, None], trusted.poses, redrawn.poses)
+    weights = jnp.where(high, trusted.weights, redrawn.weights)
+    dead = ~(weights.sum() > 0)
+    poses = jnp.where(dead, spare, poses)
+    weights = jnp.where(dead, 0.0, weights)
+    normalised = normalise(weights)
+    return ParticleState(poses, weights, normalised, state.updates + 1), describe(
+        poses, normalised, 1.0 - high.mean(), dead
+    )
+
+
+def mixture_update(
+    key: Key,
+    state: ParticleState,
+    high: Array,
+    inputs: Inputs,
+    world: World,
+    proposal: Proposal,
+    prepared: Any,
+    config: FilterConfig,
+) -> tuple[ParticleState, Info]:
+    """MCL update of the particles ``high`` (N,), dual MCL update of the others (Alg 1, lines 10 to 21)."""
+    k_high, k_low, k_spare = jax.random.split(key, 3)
+    trusted = mcl_update(k_high, state, high, inputs, world, config)
+    redrawn = dual_update(k_low, state, inputs, world, proposal, prepared, config)
+    spare, _ = proposal.sample(k_spare, prepared, config.particles)
+    return mix(state, high, trusted, redrawn, spare)

@@ -1,0 +1,52 @@
+"""The paper's proposal: the probability map of DSOM."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+from flax import nnx
+
+from dsom_jax import pose_grid as pg
+from dsom_jax.lidar import LidarConfig
+from dsom_jax.nn import DSOM, MapFeatures, encode_map, log_probability_map
+from dsom_jax.occupancy import OccupancyGrid, resample
+from dsom_jax.types import Array, Inputs, Key
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class DSOMProposal:
+    """PM of a trained network on one map; the map's features are computed once.
+
+    Attributes:
+        weights: parameters and batch statistics of the network.
+        features: what the environment encoder says of the map.
+        pose_grid: (H, W, K) cells of PM.
+        graph: structure of the network (static).
+        lidar: geometry of the whole scan (static).
+    """
+
+    weights: Any
+    features: MapFeatures
+    pose_grid: pg.PoseGrid
+    graph: Any = field(metadata={"static": True})
+    lidar: LidarConfig = field(metadata={"static": True})
+
+    def prepare(self, inputs: Inputs) -> pg.ProbabilityMap:
+        """One pass of the scan encoder and the decoder."""
+        log_pm = log_probability_map(nnx.merge(self.graph, self.weights), self.features, inputs.ranges, self.lidar)
+        return pg.from_log(self.pose_grid, log_pm, self.features.free)
+
+    def sample(self, key: Key, prepared: pg.ProbabilityMap, n: int) -> tuple[Array, Array]:
+        """``n`` poses (n, 3) from PM and their log densities."""
+        return pg.sample(key, prepared, n)
+
+
+def dsom(model: DSOM, grid: OccupancyGrid, lidar: LidarConfig) -> DSOMProposal:
+    """Proposal of an evaluation view of a network, on a map resampled to the network's scale."""
+    scaled = grid if abs(grid.resolution - model.config.resolution) < 1e-4 else resample(grid, model.config.resolution)
+    graph, weights = nnx.split(model)
+    features = encode_map(model, scaled.occupied, scaled.free)
+    return DSOMProposal(nnx.as_pure(weights), features, pg.over(scaled, model.config.headings), graph, lidar)
