@@ -1,0 +1,275 @@
+"""``python -m dsom_jax.bench``: every method on every sequence of a suite, 100 times, in one table per phase."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+import tyro
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from dsom_jax import metrics, plotting, report
+from dsom_jax.checkpoint import load as load_network
+from dsom_jax.data.suite import Suite, load_suite
+from dsom_jax.episode import Episode
+from dsom_jax.errors import UserError, run_cli
+from dsom_jax.filters.methods import METHODS, build_filter, needs_checkpoint
+from dsom_jax.montecarlo import Result, run, run_keys, signature
+from dsom_jax.occupancy import OccupancyGrid
+from dsom_jax.types import Filter, Key
+
+ESTIMATES = ("mean", "cluster")
+"""The weighted mean of the paper, and the mean of the heaviest cluster."""
+
+
+@dataclass(frozen=True)
+class Args:
+    """Compare localization methods on a suite of drives, each with one kidnapping."""
+
+    runs: int = 100
+    """Monte-Carlo runs of each method on each sequence."""
+    suite: str = "synthetic-v1"
+    """Name of a suite, or a TOML file that describes one."""
+    methods: str = ""
+    """Comma-separated method names; default: all, without --checkpoint all that need none."""
+    particles: int = 200
+    """Particles per run."""
+    t_cut: float = 0.6
+    """T_cut of Alg 1: particles with a higher trust always keep their history."""
+    seed: int = 0
+    """Seed of all randomness; method, sequence and run number do the rest."""
+    out: Path | None = None
+    """Folder for bench.json, bench.md and figures."""
+    checkpoint: Path | None = None
+    """Folder of a trained DSOM."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What all methods have in common; see :class:`Args`."""
+
+    runs: int = 100
+    particles: int = 200
+    t_cut: float = 0.6
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name, value in (("--runs", self.runs), ("--particles", self.particles)):
+            if value < 1:
+                raise UserError(f"{name} {value}: give at least 1")
+        if not 0 < self.t_cut < 1:
+            raise UserError(f"--t-cut {self.t_cut}: give a number between 0 and 1 (the paper uses 0.6)")
+        if self.seed < 0:
+            raise UserError(f"--seed {self.seed}: give 0 or more")
+
+
+class Record(NamedTuple):
+    """What one method did.
+
+    Attributes:
+        runs: by estimate (``mean``, ``cluster``) and phase.
+        traces: E_pos (R, T) of each sequence, metres, by the estimate that the method is judged by.
+        ms_per_step: milliseconds of one update of all runs.
+        filter, result: those of the first sequence, for pictures.
+    """
+
+    runs: dict[str, dict[str, metrics.Runs]]
+    traces: list[np.ndarray]
+    ms_per_step: float
+    filter: Filter
+    result: Result
+
+
+Build = Callable[[str, OccupancyGrid, Episode], Filter]
+Advance = Callable[[str, int], None]
+
+
+def benchmark(
+    suite: Suite,
+    methods: Sequence[str],
+    runs: int = 100,
+    particles: int = 200,
+    t_cut: float = 0.6,
+    seed: int = 0,
+    progress: Advance | None = None,
+    checkpoint: Any = None,
+) -> dict[str, Any]:
+    """The contents of ``bench.json``; ``progress(method, sequence)`` is called before each drive."""
+    settings = Settings(runs, particles, t_cut, seed)
+    return summary(suite, collect(suite, methods, settings, progress, checkpoint), settings)
+
+
+def collect(
+    suite: Suite, methods: Sequence[str], settings: Settings, progress: Advance | None = None, checkpoint: Any = None
+) -> dict[str, Record]:
+    """Run every method on every sequence; run r of a sequence has the same key for all methods."""
+    check_methods(methods, checkpoint)
+
+    def build(name: str, grid: OccupancyGrid, episode: Episode) -> Filter:
+        own = {"particles": settings.particles, "t_cut": settings.t_cut, "episode": episode, "checkpoint": checkpoint}
+        return build_filter(name, grid, suite.lidar, **own)
+
+    keys = [run_keys(settings.seed, number, settings.runs) for number in range(len(suite.episodes))]
+    return {name: run_method(name, suite, keys, build, progress) for name in methods}
+
+
+def check_methods(methods: Sequence[str], checkpoint: Any = None) -> None:
+    """UserError for names that are none, and for methods that lack their network."""
+    unknown = [name for name in methods if name not in METHODS]
+    if unknown or not methods:
+        raise UserError(f"--methods: unknown {', '.join(unknown) or '(none)'}; choose from {', '.join(METHODS)}")
+    untrained = [name for name in methods if needs_checkpoint(name) and checkpoint is None]
+    if untrained:
+        raise UserError(f"--checkpoint: {', '.join(untrained)} needs a trained network; name its folder")
+
+
+def chosen_methods(names: str, checkpoint: Path | None) -> tuple[str, ...]:
+    """The methods of a comma-separated list; an empty one means all that can be run."""
+    methods = tuple(dict.fromkeys(name.strip() for name in names.split(",") if name.strip()))
+    methods = methods or tuple(name for name in METHODS if checkpoint or not needs_checkpoint(name))
+    check_methods(methods, checkpoint)
+    return methods
+
+
+def run_method(name: str, suite: Suite, keys: Sequence[Key], build: Build, progress: Advance | None = None) -> Record:
+    """One method on all sequences."""
+    parts: dict[str, dict[str, list[metrics.Runs]]] = {e: {"global": [], "kidnap": []} for e in ESTIMATES}
+    traces, clock = [], Clock()
+    first: tuple[Any, ...] = ()
+    for number, (_, grid, episode) in enumerate(suite.episodes):
+        if progress:
+            progress(name, number)
+        filter = build(name, grid, episode)
+        result = clock.run(filter, episode, keys[number])
+        for estimate, by_phase in parts.items():
+            for phase, runs in judge(result, episode, estimate).items():
+                by_phase[phase] += runs
+        e_pos, _ = metrics.pose_error(getattr(result.info, judged_by(name)), episode.poses)
+        traces.append(np.asarray(e_pos))
+        first = first or (filter, result)
+    pooled = {e: {phase: metrics.pool(runs) for phase, runs in by.items()} for e, by in parts.items()}
+    return Record(pooled, traces, clock.ms_per_step(), *first)
+
+
+def judge(result: Result, episode: Episode, estimate: str) -> dict[str, list[metrics.Runs]]:
+    """Metrics of each phase of one drive, from slices of the same runs; ``estimate`` is ``mean`` or ``cluster``."""
+    poses, lost, truth = (np.asarray(x) for x in (getattr(result.info, estimate), result.info.lost, episode.poses))
+    cuts = metrics.phases(episode.kidnapped)
+    return {
+        phase: [metrics.measure(poses[:, part], truth[part], lost[:, part]) for part in parts]
+        for phase, parts in cuts.items()
+    }
+
+
+def judged_by(method: str) -> str:
+    """The paper's filters answer with the weighted mean; ours with the heaviest cluster."""
+    return "cluster" if method.startswith("robust") else "mean"
+
+
+class Clock:
+    """Times runs, leaving out those that had to be compiled first."""
+
+    def __init__(self) -> None:
+        self.compiled: set[Any] = set()
+        self.seconds: list[float] = []
+        self.last: tuple[Filter, Episode, Key] | None = None
+
+    def run(self, filter: Filter, episode: Episode, keys: Key) -> Result:
+        """As :func:`montecarlo.run`, finished on return."""
+        start = time.perf_counter()
+        result = jax.block_until_ready(run(filter, episode, keys, moments(episode)))
+        elapsed = (time.perf_counter() - start) / episode.ranges.shape[0]
+        shape = (signature(filter, episode), keys.shape)
+        if shape in self.compiled:
+            self.seconds.append(elapsed)
+        self.compiled.add(shape)
+        self.last = filter, episode, keys
+        return result
+
+    def ms_per_step(self) -> float:
+        """Median milliseconds of one update of all runs together, compilation excluded."""
+        if not self.seconds and self.last:
+            self.run(*self.last)
+        return 1e3 * float(np.median(self.seconds))
+
+
+def moments(episode: Episode) -> tuple[int, ...]:
+    """Four updates worth a picture: the start, soon after, the first kidnapping (or half way), soon after."""
+    moved = np.flatnonzero(np.asarray(episode.kidnapped)[1:]) + 1
+    last = len(episode.ranges) - 1
+    middle = int(moved[0]) if len(moved) else last // 2
+    return 0, min(5, last), middle, min(middle + 5, last)
+
+
+def summary(suite: Suite, records: dict[str, Record], settings: Settings) -> dict[str, Any]:
+    """``bench.json``: see :mod:`dsom_jax.report`."""
+    methods = {}
+    for name, record in records.items():
+        tables = {
+            estimate: {phase: metrics.summarize(runs, settings.seed) for phase, runs in by_phase.items()}
+            for estimate, by_phase in record.runs.items()
+        }
+        chosen = judged_by(name)
+        extra = {"ms_per_step": record.ms_per_step, "estimate": chosen, "estimates": tables}
+        methods[name] = tables[chosen] | extra
+    device = f"{jax.device_count()} x {jax.devices()[0].device_kind} ({jax.default_backend()})"
+    return {"suite": suite.name, **asdict(settings), "device": device, "sequences": len(suite.episodes),
+            "methods": methods}  # fmt: skip
+
+
+def save(folder: Path, suite: Suite, records: dict[str, Record], data: dict[str, Any]) -> None:
+    """Write bench.json, bench.md and the figures."""
+    report.write_json(folder / "bench.json", data)
+    report.write_text(folder / "bench.md", report.markdown(data))
+    runs = {name: record.runs[judged_by(name)] for name, record in records.items()}
+    traces = [{name: record.traces[n] for name, record in records.items()} for n in range(len(suite.episodes))]
+    moved = [np.asarray(episode.kidnapped) for _, _, episode in suite.episodes]
+    figures = plotting.benchmark_figures(runs, traces, moved)
+    _, grid, episode = suite.episodes[0]
+    for name, (_, _, _, filter, result) in records.items():
+        estimates = getattr(result.info, judged_by(name))[0]
+        figures[f"map_{name}"] = plotting.moment_figure(
+            grid, suite.lidar, episode, filter, moments(episode), result.kept.poses, estimates
+        )
+    for name, figure in figures.items():
+        plotting.save(figure, folder / f"{name}.png")
+
+
+def progress_bar(total: int) -> tuple[Progress, Advance]:
+    """A bar on stderr over (method, sequence) pairs, and the function that moves it."""
+    bar = Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
+                   console=report.terminal(stderr=True), transient=True)  # fmt: skip
+    task = bar.add_task("starting", total=total)
+    started: list[str] = []
+
+    def advance(method: str, sequence: int) -> None:
+        bar.update(task, description=f"{method}, sequence {sequence + 1}", completed=len(started))
+        started.append(method)
+
+    return bar, advance
+
+
+def main() -> None:
+    """Argument handling."""
+    args = tyro.cli(Args, prog="python -m dsom_jax.bench")
+    settings = Settings(args.runs, args.particles, args.t_cut, args.seed)
+    methods = chosen_methods(args.methods, args.checkpoint)
+    suite = load_suite(args.suite)
+    network = load_network(args.checkpoint, suite.lidar) if args.checkpoint else None
+    folder = report.output_folder(args.out) if args.out else None
+    bar, advance = progress_bar(len(methods) * len(suite.episodes))
+    with bar:
+        records = collect(suite, methods, settings, advance, network)
+    data = summary(suite, records, settings)
+    report.print_tables(data)
+    if folder:
+        save(folder, suite, records, data)
+
+
+if __name__ == "__main__":
+    run_cli(main)

@@ -1,0 +1,124 @@
+"""Monte-Carlo runs of a filter over an episode: time scanned outside, runs mapped inside, one call on the device.
+
+``filter`` is a pytree (a registered frozen dataclass): settings are static, maps and parameters are traced, so another
+map of the same shape or another episode of the same length costs no compilation. Whatever a scan needs once
+(:meth:`Filter.prepare`, a DSOM pass) is computed once per update and shared by all runs. Runs are spread over every
+visible JAX device.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.sharding import AxisType, Mesh, NamedSharding
+from jax.sharding import PartitionSpec as P
+
+from dsom_jax.episode import Episode
+from dsom_jax.types import Array, Filter, Inputs, Key
+
+
+class Result(NamedTuple):
+    """What R runs over T updates gave.
+
+    Attributes:
+        info: the filter's diagnostics, leaves (R, T, ...): at least ``mean``, ``cluster`` (R, T, 3), ``lost`` (R, T).
+        state: the filter's state after the last update, leaves (R, ...).
+        kept: states of run 0 after each of the K updates asked for, leaves (K, ...); None without any.
+    """
+
+    info: Any
+    state: Any
+    kept: Any
+
+
+def run_keys(seed: int, episode: int, runs: int) -> Key:
+    """(R,) keys that depend on (seed, episode, run) alone: methods are compared on the same luck."""
+    root = jax.random.fold_in(jax.random.key(seed), episode)
+    return jax.vmap(lambda r: jax.random.fold_in(root, r))(jnp.arange(runs))
+
+
+def run(filter: Filter, episode: Episode, keys: Key, keep: Sequence[int] = ()) -> Result:
+    """Run ``filter`` over ``episode`` once per key (R,); run r depends on ``keys[r]`` only, bit for bit.
+
+    ``keep`` names updates after which the state of run 0 is kept, for a look at its particles. Not for use inside
+    ``jit``: it places arrays on devices and chooses compiler options.
+    """
+    runs, mesh = keys.shape[0], _mesh()
+    if runs < 1:
+        raise ValueError("run: keys is empty, give at least one")
+    # Devices take equal shares, so the last run is repeated to fill up and cut off again.
+    filled = -(-runs // mesh.size) * mesh.size
+    keys = jax.device_put(keys[jnp.minimum(jnp.arange(filled), runs - 1)], NamedSharding(mesh, P("runs")))
+    chosen = jnp.asarray(keep, jnp.int32) if len(keep) else None
+    shared = jax.device_put((filter, episode.inputs, chosen), NamedSharding(mesh, P()))
+    info, state, kept = _runner(mesh)(*shared, keys)
+    info, state = jax.tree.map(lambda leaf: leaf[:runs], (info, state))
+    return Result(info, state, jax.tree.map(lambda leaf: leaf[0], kept))
+
+
+def run_segments(filter: Filter, episodes: Sequence[Episode], keys: Key, keep: Sequence[int] = ()) -> Result:
+    """Run S episodes of one shape, each from scratch, with keys (S, R): leaves of the result are (S, ...)."""
+    shapes = {episode.ranges.shape for episode in episodes}
+    if len(shapes) != 1:
+        raise ValueError(f"run_segments: episodes differ in shape (T, B): {sorted(shapes)}")
+    results = [run(filter, episode, k, keep) for episode, k in zip(episodes, keys, strict=True)]
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *results)
+
+
+def signature(filter: Filter, episode: Episode) -> Any:
+    """Hashable: two calls of :func:`run` with equal signatures and numbers of runs share one compilation."""
+    leaves, structure = jax.tree.flatten((filter, episode))
+    return structure, tuple((jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
+
+
+def simulate(filter: Filter, inputs: Inputs, keep: Array | None, keys: Key) -> tuple[Any, Any, Any]:
+    """The pure computation of one device: info (R, T, ...), state (R, ...), kept (1, K, ...).
+
+    inputs (T, ...), keys (R,); ``keep`` (K,) are updates, or None.
+    """
+
+    def update(states: Any, now: Inputs) -> tuple[Any, Any]:
+        prepared = filter.prepare(now)
+        step_keys = _fold(keys, now.index + 1)
+        states, info = jax.vmap(lambda key, state: filter.step(key, state, now, prepared))(step_keys, states)
+        return states, (info, None if keep is None else jax.tree.map(lambda leaf: leaf[0], states))
+
+    states, (info, shown) = jax.lax.scan(update, jax.vmap(filter.init)(_fold(keys, 0)), inputs)
+    by_run = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), info)
+    return by_run, states, jax.tree.map(lambda leaf: leaf[keep][None], shown)
+
+
+def _fold(keys: Key, number: Array | int) -> Key:
+    """The keys of one update: 0 is the start, t + 1 is update t."""
+    return jax.vmap(lambda key: jax.random.fold_in(key, number))(keys)
+
+
+def _mesh() -> Mesh:
+    return jax.make_mesh((jax.device_count(),), ("runs",), axis_types=(AxisType.Auto,))
+
+
+@cache
+def _runner(mesh: Mesh) -> Any:
+    """The compiled :func:`simulate`, each device with its own share of the runs and no talk between them."""
+    spread = jax.shard_map(
+        simulate, mesh=mesh, in_specs=(P(), P(), P(), P("runs")), out_specs=P("runs"), check_vma=False
+    )
+    return jax.jit(spread, compiler_options=_options())
+
+
+def _options() -> dict[str, str]:
+    """XLA's YNNPACK sums rows in an order that depends on how many rows there are, so that run r of 100 would differ
+    from run r alone in the last bits; XLA's own loops do not. Matrix products and convolutions keep the library.
+    """
+    options = {"xla_cpu_experimental_ynn_fusion_type": "LIBRARY_FUSION_TYPE_DOT"}
+    if jax.default_backend() != "cpu":
+        return {}
+    try:
+        jax.jit(lambda x: x, compiler_options=options)(0.0)
+    except jax.errors.JaxRuntimeError:  # an XLA without this experimental switch
+        return {}
+    return options

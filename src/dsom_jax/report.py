@@ -1,0 +1,168 @@
+"""Results as files and tables: ``bench.json``, terminal tables of 100 columns, markdown for pages.
+
+``bench.json`` holds, beside what was asked for, ``methods``: NAME -> {"global": M, "kidnap": M, "ms_per_step",
+"estimate", "estimates"}. M is :func:`dsom_jax.metrics.summarize`; ``ms_per_step`` is the time of one update of all
+runs together; ``estimate`` says whether M judges the weighted ``mean`` or the heaviest ``cluster``, and ``estimates``
+has M for both.
+Values that do not exist (a mean over no runs) are null.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from dsom_jax.errors import UserError
+
+PHASES = {"global": "Global localization", "kidnap": "Kidnapping"}
+
+
+def output_folder(path: str | Path) -> Path:
+    """``path`` as a folder that exists and takes files; UserError otherwise. Call it before any work is done."""
+    folder = Path(path)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise UserError(f"--out {folder}: cannot write there ({reason}): name a folder that can be written") from None
+    return folder
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write ``path`` whole or not at all: a file beside it, then a rename."""
+    draft = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        draft.write_text(text, encoding="utf-8")
+        draft.replace(path)
+    finally:
+        draft.unlink(missing_ok=True)
+
+
+def write_json(path: Path, data: Any) -> None:
+    """Write ``data`` to ``path`` atomically as strict JSON: NaN and infinities become null."""
+    write_text(path, json.dumps(plain(data), indent=2, allow_nan=False) + "\n")
+
+
+def plain(data: Any) -> Any:
+    """``data`` with NumPy scalars and arrays as numbers and lists, and what is not finite as None."""
+    if isinstance(data, dict):
+        return {str(key): plain(value) for key, value in data.items()}
+    if isinstance(data, (list, tuple)):
+        return [plain(value) for value in data]
+    if hasattr(data, "tolist"):
+        return plain(data.tolist())
+    if isinstance(data, Path):
+        return str(data)
+    return None if isinstance(data, float) and not math.isfinite(data) else data
+
+
+Cell = Callable[[dict[str, Any], float], str]
+"""The text of a cell, from M and the milliseconds of a step."""
+COLUMNS: dict[str, Cell] = {
+    "converged %": lambda m, _: _percent(m["converged"]) + _interval(m["converged_ci95"], 100),
+    "0-20 %": lambda m, _: _percent(_early(m)),
+    "steps": lambda m, _: _number(m["steps_median"], 0),
+    "E_pos m": lambda m, _: _number(m["e_pos_m"], 3),
+    "E_th rad": lambda m, _: _number(m["e_theta_rad"], 3),
+    "kept %": lambda m, _: _percent(m["retention"]),
+    "strict %": lambda m, _: _percent(m["strict_success"]),
+    "ms/step": lambda _, ms: _number(ms, 1),
+}
+LEGEND = """\
+converged: 5 updates in a row within 2 m and 10 deg [95 % interval]; 0-20: within 20 updates;
+steps: updates before converging, median; E: mean final error of the converged runs;
+kept: share of the later updates still within; strict: last estimate within 0.5 m and 5 deg;
+ms/step: one update of all runs together."""
+
+
+def table(report: dict[str, Any], phase: str) -> Table:
+    """The results of one phase, one row per method."""
+    title = _title(report, phase)
+    result = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False)
+    result.add_column("method", no_wrap=True)
+    for head in COLUMNS:
+        result.add_column(head, justify="right", no_wrap=True)
+    for name, entry in report["methods"].items():
+        result.add_row(name, *_cells(entry, phase))
+    return result
+
+
+def print_tables(report: dict[str, Any], console: Console | None = None) -> None:
+    """Print one table per phase that was run; 100 columns where the output is no terminal."""
+    console = console or terminal()
+    for phase in _phases(report):
+        console.print(table(report, phase), "")
+    console.print(LEGEND, style="dim", highlight=False)
+
+
+def terminal(stderr: bool = False) -> Console:
+    """A console as wide as the terminal, or 100 columns when written to a file or a pipe."""
+    console = Console(stderr=stderr)
+    return console if console.is_terminal else Console(stderr=stderr, width=100)
+
+
+def markdown(report: dict[str, Any]) -> str:
+    """The same tables for a README."""
+    blocks = []
+    for phase in _phases(report):
+        head = ["method", *COLUMNS]
+        rule = ["---", *["---:"] * len(COLUMNS)]
+        rows = [[f"`{name}`", *_cells(entry, phase, intervals=True)] for name, entry in report["methods"].items()]
+        lines = ["| " + " | ".join(row) + " |" for row in (head, rule, *rows)]
+        blocks.append(f"**{_title(report, phase)}**\n\n" + "\n".join(lines))
+    return "\n\n".join(blocks) + "\n"
+
+
+def _phases(report: dict[str, Any]) -> list[str]:
+    """The phases in which at least one experiment was made."""
+    entries = report["methods"].values()
+    return [phase for phase in PHASES if any(entry[phase]["experiments"] for entry in entries)]
+
+
+def _title(report: dict[str, Any], phase: str) -> str:
+    experiments = max(entry[phase]["experiments"] for entry in report["methods"].values())
+    return f"{PHASES[phase]} · {report['suite']} · {experiments} experiments · {report['particles']} particles"
+
+
+def _cells(entry: dict[str, Any], phase: str, intervals: bool = False) -> list[str]:
+    """The row of a method; ``intervals`` of the errors only where there is room for them."""
+    cells = {head: cell(entry[phase], entry["ms_per_step"]) for head, cell in COLUMNS.items()}
+    if intervals:
+        cells["E_pos m"] += _interval(entry[phase]["e_pos_ci95"], 1, 3)
+        cells["E_th rad"] += _interval(entry[phase]["e_theta_ci95"], 1, 3)
+    return list(cells.values())
+
+
+def _early(m: dict[str, Any]) -> float:
+    """Share of the runs that converged within 20 updates."""
+    return m["steps_hist"]["0-20"] / m["experiments"] if m["experiments"] else math.nan
+
+
+def _missing(value: float | None) -> bool:
+    return value is None or not math.isfinite(value)
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
+
+
+def _percent(rate: float | None) -> str:
+    return "-" if rate is None else _number(100 * rate, 1)
+
+
+def _interval(bounds: list[float], scale: float, digits: int = 0) -> str:
+    if any(_missing(bound) for bound in bounds):
+        return ""
+    low, high = (scale * bound for bound in bounds)
+    return f" [{low:.{digits}f}-{high:.{digits}f}]"

@@ -1,0 +1,187 @@
+"""The benchmark on filters whose results are known beforehand, and its command line."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dsom_jax import bench
+from dsom_jax.episode import Episode
+from dsom_jax.errors import UserError, run_cli
+from dsom_jax.lidar import LidarConfig
+from dsom_jax.occupancy import from_cells
+
+STEPS, MOVED = 24, 12
+M_KEYS = {
+    "experiments", "converged", "converged_ci95", "steps_median", "steps_hist", "e_pos_m", "e_theta_rad", "e_pos_ci95",
+    "retention", "strict_success",
+}  # fmt: skip
+
+
+class State(NamedTuple):
+    poses: Any
+
+
+class Info(NamedTuple):
+    mean: Any
+    cluster: Any
+    lost: Any
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Oracle:
+    """Reads the truth, ``delay`` updates after the start and after the kidnapping; the mean is off by 1 m."""
+
+    truth: Any
+    delay: int = field(metadata={"static": True})
+    particles: int = field(metadata={"static": True})
+
+    def prepare(self, inputs):
+        return self.truth[inputs.index]
+
+    def init(self, key):
+        return State(jax.random.uniform(key, (self.particles, 3)))
+
+    def step(self, key, state, inputs, prepared):
+        late = (inputs.index % MOVED) < self.delay
+        luck = 0.01 * jax.random.uniform(key, ())
+        place = prepared + jnp.where(late, 20.0, luck) * jnp.array([1.0, 0, 0])
+        return state, Info(place + jnp.array([1.0, 0, 0]), place, jnp.where(late, 0.9, 0.0))
+
+
+DELAYS = {"mcl": 99, "adam_likelihood_grid": 3, "robust_likelihood_grid": 0, "adam_dsom": 0}
+
+
+def drive(seed: int) -> Episode:
+    rng = np.random.default_rng(seed)
+    poses = np.c_[rng.uniform(2, 8, (STEPS, 2)), rng.uniform(-3, 3, STEPS)]
+    return Episode(
+        jnp.full((STEPS, 8), 2.0), jnp.zeros((STEPS, 3)), jnp.asarray(poses, jnp.float32),
+        jnp.arange(STEPS) == MOVED, jnp.arange(STEPS, dtype=jnp.float32),
+    )  # fmt: skip
+
+
+@pytest.fixture
+def suite(monkeypatch):
+    grid = from_cells(np.zeros((20, 20), bool), resolution=0.5)
+    lidar = LidarConfig(beams=8, angle_increment=0.7)
+    made = SimpleNamespace(name="made-up", lidar=lidar, episodes=tuple(("m", grid, drive(s)) for s in range(3)))
+
+    def load(name):
+        if name != "made-up":
+            raise UserError(f"--suite {name}: no such suite")
+        return made
+
+    def build(name, grid, lidar, *, particles, t_cut, episode, checkpoint):
+        return Oracle(episode.poses, DELAYS[name], particles)
+
+    monkeypatch.setattr(bench, "load_suite", load)
+    monkeypatch.setattr(bench, "build_filter", build)
+    return made
+
+
+def command(monkeypatch, *words: str) -> None:
+    monkeypatch.setattr(sys, "argv", ["bench", "--suite", "made-up", "--runs", "4", "--particles", "5", *words])
+    run_cli(bench.main)
+
+
+def test_known_filters_get_their_numbers(suite):
+    data = bench.benchmark(suite, ("mcl", "adam_likelihood_grid", "robust_likelihood_grid"), runs=4, particles=5)
+    assert set(data) >= {"suite", "runs", "particles", "t_cut", "seed", "device", "methods"}
+    assert (data["suite"], data["runs"], data["particles"], data["t_cut"], data["seed"]) == ("made-up", 4, 5, 0.6, 0)
+    lost, late, soon = data["methods"].values()
+    for phase in ("global", "kidnap"):
+        for entry in (lost, late, soon):
+            assert set(entry[phase]) >= M_KEYS and entry[phase]["experiments"] == 12
+            assert entry["ms_per_step"] > 0
+        assert (lost[phase]["converged"], late[phase]["converged"], soon[phase]["converged"]) == (0, 1, 1)
+        assert (late[phase]["steps_median"], soon[phase]["steps_median"]) == (3, 0)
+        assert lost[phase]["steps_hist"] == {"0-20": 0, "20-40": 0, "40-60": 0, ">60": 0, "never": 12}
+        # The paper's filters are judged by the weighted mean, ours by the heaviest cluster.
+        assert late[phase]["e_pos_m"] == pytest.approx(1.005, abs=0.01) and late["estimate"] == "mean"
+        assert soon[phase]["e_pos_m"] < 0.01 and soon["estimate"] == "cluster"
+        assert late["estimates"]["cluster"][phase]["strict_success"] == 1 and late[phase]["strict_success"] == 0
+        assert soon[phase]["retention"] == 1
+
+
+def test_same_seed_same_numbers_and_methods_share_their_luck(suite):
+    def numbers(seed, *methods):
+        data = bench.benchmark(suite, methods, runs=3, particles=5, seed=seed)["methods"]
+        return [entry["estimates"]["cluster"] for entry in data.values()]
+
+    first, again = (numbers(3, "adam_likelihood_grid", "robust_likelihood_grid") for _ in range(2))
+    assert first == again
+    assert first[0]["global"]["e_pos_m"] == first[1]["global"]["e_pos_m"]
+    assert numbers(4, "robust_likelihood_grid")[0] != first[1]
+
+
+def test_progress_names_every_drive(suite):
+    seen = []
+    bench.benchmark(suite, ("mcl",), runs=1, particles=5, progress=lambda *now: seen.append(now))
+    assert seen == [("mcl", 0), ("mcl", 1), ("mcl", 2)]
+
+
+def test_command_line(suite, monkeypatch, tmp_path, capsys):
+    command(monkeypatch, "--methods", "mcl, robust_likelihood_grid", "--out", str(tmp_path / "out"), "--seed", "2")
+    shown = capsys.readouterr().out
+    assert "Global localization" in shown and "Kidnapping" in shown and "robust_likelihood_grid" in shown
+    data = json.loads((tmp_path / "out" / "bench.json").read_text(), parse_constant=pytest.fail)
+    assert list(data["methods"]) == ["mcl", "robust_likelihood_grid"] and data["seed"] == 2
+    assert data["methods"]["mcl"]["global"]["e_pos_m"] is None
+    assert {p.name for p in (tmp_path / "out").iterdir()} == {
+        "bench.json", "bench.md", "position_error.png", "converging_steps.png", "error_evolution.png",
+        "map_mcl.png", "map_robust_likelihood_grid.png",
+    }  # fmt: skip
+
+
+def test_default_methods_are_those_that_can_be_run(tmp_path):
+    assert "adam_dsom" not in bench.chosen_methods("", None) and "mcl" in bench.chosen_methods("", None)
+    assert bench.chosen_methods("", tmp_path) == bench.METHODS
+    assert bench.chosen_methods("mcl,mcl", None) == ("mcl",)
+
+
+@pytest.mark.parametrize(
+    ("words", "field"),
+    [
+        (("--runs", "0"), "--runs"),
+        (("--particles", "-3"), "--particles"),
+        (("--t-cut", "1.5"), "--t-cut"),
+        (("--t-cut", "nan"), "--t-cut"),
+        (("--seed", "-1"), "--seed"),
+        (("--methods", "mcl,magic"), "magic"),
+        (("--methods", "adam_dsom"), "--checkpoint"),
+        (("--suite", "nowhere"), "nowhere"),
+        (("--out", "FILE"), "--out"),
+        (("--checkpoint", "FILE"), "FILE"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2_before_any_work(suite, monkeypatch, tmp_path, capsys, words, field):
+    (tmp_path / "FILE").touch()
+    monkeypatch.setattr(bench, "collect", lambda *_: pytest.fail("work was begun"))
+    with pytest.raises(SystemExit) as stop:
+        command(monkeypatch, *(word.replace("FILE", str(tmp_path / "FILE")) for word in words))
+    error = capsys.readouterr().err
+    assert stop.value.code == 2
+    assert (
+        error.startswith("error: ")
+        and error.count("\n") == 1
+        and field.replace("FILE", "file") in error.replace("FILE", "file")
+    )
+
+
+def test_as_a_module():
+    done = subprocess.run(
+        [sys.executable, "-m", "dsom_jax.bench", "--methods", "magic"], capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 2 and done.stdout == ""
+    assert done.stderr.startswith("error: --methods") and done.stderr.count("\n") == 1

@@ -1,0 +1,141 @@
+"""The layers of the package: imports point down only, and the mathematics touches neither files nor pictures."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import dsom_jax
+
+ROOT = Path(dsom_jax.__file__).parent
+LAYERS = (
+    ("types", "geometry", "errors"),
+    ("occupancy", "lidar", "raycast", "resampling", "pose_grid", "episode"),
+    ("motion", "sensor", "nn", "simulate"),
+    ("proposals", "metrics"),
+    ("filters", "training", "montecarlo"),
+    ("data", "checkpoint", "plotting", "report"),
+    ("train", "bench", "localize", "evaluate"),
+)
+DEVICE = 5
+"""Layers below this are device code."""
+LAYER = {name: level for level, names in enumerate(LAYERS) for name in names}
+BANNED_IMPORTS = {
+    "orbax", "cv2", "matplotlib", "PIL", "pathlib", "os", "io", "shutil", "tempfile", "glob", "json", "yaml", "tomllib",
+    "pickle", "csv", "gzip", "zipfile", "subprocess", "rich", "tyro", "rosbags",
+}  # fmt: skip
+BANNED_CALLS = {
+    "open", "input", "load", "save", "savez", "savez_compressed", "loadtxt", "savetxt", "genfromtxt", "fromfile",
+    "tofile", "memmap", "read_text", "read_bytes", "write_text", "write_bytes", "mkdir", "unlink",
+}  # fmt: skip
+MODULES = sorted(ROOT.rglob("*.py"))
+
+
+def module_name(path: Path) -> str:
+    """Dotted name inside the package: ``filters.adam``; the package itself is empty."""
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(part for part in parts if part != "__init__")
+
+
+def layer(module: str) -> int:
+    """Layer of a module; the package's own ``__init__`` is above everything."""
+    return LAYER[module.split(".")[0]] if module else len(LAYERS)
+
+
+def absolute(node: ast.ImportFrom, path: Path) -> str:
+    """The module that ``from ... import`` names, relative forms resolved."""
+    if not node.level:
+        return node.module or ""
+    package = ("dsom_jax", *path.relative_to(ROOT).parts[:-1])
+    return ".".join([*package[: len(package) - node.level + 1], *filter(None, [node.module])])
+
+
+def imports(path: Path, tree: ast.AST) -> Iterator[str]:
+    """Dotted names of everything imported anywhere in a file, also inside functions."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = absolute(node, path)
+            yield from (f"{base}.{alias.name}" if is_module(f"{base}.{alias.name}") else base for alias in node.names)
+
+
+def is_module(name: str) -> bool:
+    """Whether ``from package import name`` names a module of the package rather than something in it."""
+    place = ROOT.parent.joinpath(*name.split("."))
+    return place.is_dir() or place.with_suffix(".py").is_file()
+
+
+def internal(path: Path, source: str) -> Iterator[str]:
+    """Modules of the package that a file imports, without the leading ``dsom_jax``."""
+    for name in imports(path, ast.parse(source)):
+        if name.split(".")[0] == "dsom_jax":
+            yield name.removeprefix("dsom_jax").removeprefix(".")
+
+
+def upward(path: Path, source: str) -> list[str]:
+    """Imports that point up."""
+    own = layer(module_name(path))
+    return [name for name in internal(path, source) if layer(name) > own]
+
+
+def host_things(source: str) -> list[str]:
+    """Libraries and calls of the host that device code may not use."""
+    tree = ast.parse(source)
+    found = [name for name in imports(ROOT / "x.py", tree) if name.split(".")[0] in BANNED_IMPORTS]
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call):
+            name = getattr(node.func, "attr", getattr(node.func, "id", ""))
+            found += [name] if name in BANNED_CALLS else []
+    return found
+
+
+@pytest.mark.parametrize("path", MODULES, ids=module_name)
+def test_imports_point_down(path):
+    top = module_name(path).split(".")[0]
+    assert not top or top in LAYER, f"{top} belongs to no layer: add it to LAYERS (docs of the layout: README)"
+    assert upward(path, path.read_text()) == []
+
+
+@pytest.mark.parametrize("path", [p for p in MODULES if layer(module_name(p)) < DEVICE], ids=module_name)
+def test_device_code_knows_no_host(path):
+    assert host_things(path.read_text()) == []
+
+
+def test_no_import_cycles():
+    graph = {module_name(path): set(internal(path, path.read_text())) for path in MODULES if module_name(path)}
+    done: set[str] = set()
+
+    def visit(module: str, trail: tuple[str, ...]) -> None:
+        assert module not in trail, " -> ".join((*trail, module))
+        if module not in done:
+            for other in graph.get(module, ()):
+                visit(other, (*trail, module))
+            done.add(module)
+
+    for module in graph:
+        visit(module, ())
+
+
+@pytest.mark.parametrize(
+    ("where", "line"),
+    [
+        ("geometry.py", "from dsom_jax.lidar import LidarConfig"),
+        ("metrics.py", "from dsom_jax import montecarlo"),
+        ("nn/dsom.py", "from ..filters.adam import adam"),
+        ("sensor.py", "def f():\n    import dsom_jax.proposals.dsom"),
+        ("filters/adam.py", "from dsom_jax import report as r"),
+    ],
+)
+def test_an_upward_import_is_seen(where, line):
+    assert upward(ROOT / where, line)
+
+
+@pytest.mark.parametrize(
+    "line", ["import cv2", "from orbax.checkpoint import v1", "x = np.load(f)", "open('a')", "import matplotlib.pyplot"]
+)
+def test_host_code_is_seen(line):
+    assert host_things(line)
