@@ -67,6 +67,8 @@ def build_walls(key: Key, style: Style, labels: Array, is_corridor: Array, door_
     # The second layer of a thick wall lies below and to the left of the first.
     wall, outer = (w | (style.thick & (shifted(w, 0, 1) | shifted(w, 1, 0))) for w in (wall, outer))
     cut = grow(door & ~wide, door_cells[0]) | grow(wide, door_cells[1])
+    # A narrow door in a slanted thick wall would be no wider than a slit.
+    cut = jnp.where(style.thick, grow(cut, 1), cut)
     return wall & ~(cut & ~outer), grow(cut, 2)
 
 
