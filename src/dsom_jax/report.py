@@ -1,9 +1,9 @@
 """Results as files and tables: ``bench.json``, terminal tables of 100 columns, markdown for pages.
 
 ``bench.json`` holds, beside what was asked for, ``methods``: NAME -> {"global": M, "kidnap": M, "ms_per_step",
-"estimate", "estimates"}. M is :func:`dsom_jax.metrics.summarize`; ``ms_per_step`` is the time of one update of all
-runs together; ``estimate`` says whether M judges the weighted ``mean`` or the heaviest ``cluster``, and ``estimates``
-has M for both.
+"compilations", "estimate", "estimates"}. M is :func:`dsom_jax.metrics.summarize`; ``ms_per_step`` is the time of one
+update of all runs together; ``compilations`` counts the shapes of map and episode that were compiled; ``estimate`` says
+whether M judges the weighted ``mean`` or the heaviest ``cluster``, and ``estimates`` has M for both.
 Values that do not exist (a mean over no runs) are null.
 """
 
