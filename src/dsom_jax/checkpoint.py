@@ -1,0 +1,160 @@
+"""Networks and training states on disk: an orbax folder and a readable ``provenance.json`` beside it.
+
+A checkpoint is a folder with ``provenance.json``, which says what the network is and names the folder with its
+weights. Both are written under other names and renamed, the json last, so that a reader never meets half of one.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from dataclasses import asdict, fields
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, TypeVar
+
+import jax
+import orbax.checkpoint.experimental.v1 as ocp
+from flax import nnx
+
+from dsom_jax.errors import UserError
+from dsom_jax.lidar import LidarConfig
+from dsom_jax.nn import DSOM, DSOMConfig, create, evaluation_view
+
+T = TypeVar("T")
+PROVENANCE = "provenance.json"
+FORMAT = 1
+
+
+def save(directory: str | Path, model: DSOM, provenance: dict[str, Any] | None = None, tag: str = "weights") -> None:
+    """Write ``model`` as a checkpoint, replacing an older one in the same folder in one atomic step.
+
+    Args:
+        directory: the checkpoint's folder, made if it does not exist.
+        model: training mode or evaluation view.
+        provenance: JSON-able facts to keep: seed, commit, data, metrics.
+        tag: name of the folder of the weights; must differ from that of the checkpoint replaced.
+    """
+    directory = Path(directory).absolute()
+    record = {"format": FORMAT, "model": asdict(model.config), "weights": tag, "packages": packages()}
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        _save_tree(directory / tag, _weights(model))
+        write_json(directory / PROVENANCE, {**record, **(provenance or {})})
+    except OSError as error:
+        raise UserError(f"{directory}: cannot write the checkpoint ({error.strerror}); give another folder") from error
+    for old in directory.glob("weights*"):
+        if old.name != tag:
+            shutil.rmtree(old, ignore_errors=True)
+
+
+def load(directory: str | Path, lidar: LidarConfig | None = None, resolution: float | None = None) -> DSOM:
+    """The network of a checkpoint as an evaluation view.
+
+    Args:
+        directory: of the checkpoint.
+        lidar: refuse a network that was not trained for such scans.
+        resolution: refuse a network for another scale, metres per cell.
+    """
+    record = load_provenance(directory)
+    config = _model_config(Path(directory), record)
+    _check_fit(Path(directory), config, lidar, resolution)
+    abstract = nnx.eval_shape(lambda: create(config))
+    weights = _load_tree(Path(directory).absolute() / str(record["weights"]), _weights(abstract))
+    graphdef = nnx.split(abstract, nnx.Param, nnx.BatchStat)[0]
+    return evaluation_view(nnx.merge(graphdef, weights["params"], weights["stats"]))
+
+
+def load_provenance(directory: str | Path) -> dict[str, Any]:
+    """The facts of a checkpoint: what it is, and what it was trained with and on."""
+    path = Path(directory) / PROVENANCE
+    if not path.is_file():
+        raise UserError(f"{path}: no such file; give a folder written by `python -m dsom_jax.train --out`")
+    try:
+        record = json.loads(path.read_text())
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise UserError(f"{path}: not JSON ({error}); restore the file or train again") from error
+    if not isinstance(record, dict) or record.get("format") != FORMAT:
+        raise UserError(f"{path}: field format is not {FORMAT}; this is not a checkpoint of this version, train again")
+    for name in ("model", "weights"):
+        if name not in record:
+            raise UserError(f"{path}: field {name} is missing; restore the file or train again")
+    return record
+
+
+def save_state(directory: str | Path, state: Any) -> None:
+    """Write any pytree of arrays; the folder must not exist. Atomic."""
+    _save_tree(Path(directory).absolute(), state)
+
+
+def load_state(directory: str | Path, like: T) -> T:
+    """Read a pytree that has the structure, shapes and dtypes of ``like``."""
+    return _load_tree(Path(directory).absolute(), like)
+
+
+def write_json(path: Path, record: Any) -> None:
+    """Write JSON so that ``path`` holds the old or the new text, never a part."""
+    temporary = path.with_name(path.name + ".new")
+    with temporary.open("w") as file:
+        file.write(json.dumps(record, indent=2) + "\n")
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(temporary, path)
+
+
+def packages() -> dict[str, str]:
+    """Versions of what the numbers depend on."""
+    return {name: version(name) for name in ("jax", "flax", "optax", "orbax-checkpoint", "numpy")}
+
+
+def _weights(model: DSOM) -> dict[str, Any]:
+    _, params, stats = nnx.split(model, nnx.Param, nnx.BatchStat)
+    return {"params": nnx.to_pure_dict(params), "stats": nnx.to_pure_dict(stats)}
+
+
+def _save_tree(path: Path, tree: Any) -> None:
+    """Orbax writes under a temporary name and renames, which makes it atomic."""
+    ocp.save(path, tree, overwrite=True)
+
+
+def _load_tree(path: Path, like: T) -> T:
+    if not path.is_dir():
+        raise UserError(f"{path}: the folder of the weights is missing; copy the whole checkpoint or train again")
+    abstract = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), like)
+    try:
+        tree = ocp.load(path, abstract)
+    except Exception as error:  # orbax and tensorstore raise many kinds; all mean that the files do not fit
+        reason = f"weights are damaged or of another configuration ({_first_line(error)})"
+        raise UserError(f"{path}: {reason}; train again") from error
+    for new, old in zip(jax.tree.leaves(tree), jax.tree.leaves(like), strict=True):
+        if new.shape != old.shape:
+            raise UserError(f"{path}: weights {new.shape} where the configuration has {old.shape}; train again")
+    return tree
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0][:120]
+
+
+def _model_config(directory: Path, record: dict[str, Any]) -> DSOMConfig:
+    known = {field.name for field in fields(DSOMConfig)}
+    path = directory / PROVENANCE
+    model = record["model"]
+    if not isinstance(model, dict) or set(model) - known:
+        raise UserError(f"{path}: field model does not describe a network of this version; train again")
+    try:
+        return DSOMConfig(**model)
+    except (TypeError, ValueError) as error:
+        raise UserError(f"{path}: field model: {error}") from error
+
+
+def _check_fit(directory: Path, config: DSOMConfig, lidar: LidarConfig | None, resolution: float | None) -> None:
+    misfit = config.misfit(lidar) if lidar is not None else None
+    if misfit:
+        raise UserError(f"{directory}: does not fit the lidar: {misfit}; train for it or use another proposal")
+    if resolution is not None and abs(resolution - config.resolution) > 1e-3 * config.resolution:
+        raise UserError(
+            f"{directory}: the network works at {config.resolution:.4g} m per cell, the map has {resolution:.4g};"
+            " resample the map to the network's scale"
+        )

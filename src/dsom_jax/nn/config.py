@@ -1,0 +1,74 @@
+"""What a DSOM is: everything that must be known to rebuild it before its weights are read."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from dsom_jax.lidar import LidarConfig
+
+
+@dataclass(frozen=True)
+class DSOMConfig:
+    """Architecture and scale of a network.
+
+    Attributes:
+        width: channels of the first block, w of the paper's tables (64 there).
+        headings: K, the number of orientations of PM.
+        resolution: metres per cell of the maps and scan images it was trained on.
+        encoder: ``polar`` (circular 1-D CNN over bearings, any lidar) or ``paper`` (2-D CNN on the scan image).
+        paper_head: batch norm and ELU on the last layer too, as the authors do (floors the logits at -1).
+        scan_size: cells along a side of the scan image of the ``paper`` encoder, 64 or 128.
+        range_max: metres; longer ranges count as no return.
+        channels: features of one heading bin of the ``polar`` encoder, so that D = K * channels.
+        radial_bins: radial basis functions that describe one range to the ``polar`` encoder.
+        fov_min: the narrowest scan it was trained for, radians.
+        reach_min: the shortest maximal range it was trained for, metres.
+    """
+
+    width: int = 32
+    headings: int = 32
+    resolution: float = 1 / 3
+    encoder: Literal["polar", "paper"] = "polar"
+    paper_head: bool = False
+    scan_size: int = 64
+    range_max: float = 10.0
+    channels: int = 8
+    radial_bins: int = 20
+    fov_min: float = 2 * math.pi
+    reach_min: float = 10.0
+
+    def __post_init__(self) -> None:
+        for name in ("width", "headings", "channels"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"DSOMConfig.{name} = {getattr(self, name)}: give a positive number")
+        if self.headings % 2 or self.radial_bins < 2:
+            raise ValueError("DSOMConfig: headings must be even and radial_bins at least 2")
+        if self.encoder not in ("polar", "paper"):
+            raise ValueError(f"DSOMConfig.encoder = {self.encoder!r}: choose polar or paper")
+        if self.encoder == "paper" and self.scan_size not in (64, 128):
+            raise ValueError(f"DSOMConfig.scan_size = {self.scan_size}: 64 or 128, so that 4 x 4 cells reach the MLP")
+        if not (self.resolution > 0 and self.range_max > 0):
+            raise ValueError("DSOMConfig: resolution and range_max are positive metres")
+
+    @property
+    def depth(self) -> int:
+        """D, the length of one feature vector of Eq 3."""
+        return 4 * self.width if self.encoder == "paper" else self.headings * self.channels
+
+    @property
+    def angular_bins(self) -> int:
+        """Bearings that the polar encoder reads, four in each heading bin."""
+        return 4 * self.headings
+
+    def misfit(self, lidar: LidarConfig) -> str | None:
+        """Why scans of ``lidar`` are not what the network was trained for, or None."""
+        if lidar.fov < self.fov_min - 0.02:
+            fov, least = math.degrees(lidar.fov), math.degrees(self.fov_min)
+            return f"field of view {fov:.0f} deg, trained for {least:.0f} or more"
+        if lidar.range_max < self.reach_min - 1e-3:
+            return f"range_max {lidar.range_max:g} m, trained for {self.reach_min:g} m or more"
+        if lidar.fov / lidar.beams > 4 * math.pi / self.headings:
+            return f"{lidar.beams} beams are fewer than one in two of the {self.headings} headings"
+        return None

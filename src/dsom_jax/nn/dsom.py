@@ -1,0 +1,111 @@
+"""DSOM: (map, scan) -> probability map PM over (x, y, theta). Section III of the paper."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+
+from dsom_jax.lidar import LidarConfig, scan_image
+from dsom_jax.nn.config import DSOMConfig
+from dsom_jax.nn.decoder import Decoder
+from dsom_jax.nn.encoders import EnvironmentEncoder, PaperScanEncoder, PolarScanEncoder
+from dsom_jax.nn.polar import Conditions, polar_features
+from dsom_jax.nn.pooling import pad_to_multiple
+from dsom_jax.nn.similarity import cosine_similarity
+from dsom_jax.types import Array
+
+
+class MapFeatures(NamedTuple):
+    """What the environment encoder says of one map; compute it once for each map.
+
+    Attributes:
+        features: M of Eq 2, (h, w, D) with h = ceil(H / 8), w = ceil(W / 8).
+        indices: int8 argmax of the three pools, (4h, 4w, w), (2h, 2w, 2w), (h, w, 4w).
+        free: (H, W) bool, cells that may receive probability.
+    """
+
+    features: Array
+    indices: tuple[Array, ...]
+    free: Array
+
+
+class Outputs(NamedTuple):
+    """Logits (N, S, H, W, K) of PM before the softmax, and the scaled SIM (N, S, h, w, K) of the auxiliary loss."""
+
+    logits: Array
+    similarity: Array
+
+
+class DSOM(nnx.Module):
+    """The network; batched over N maps with S scans each, so that scans share the environment encoder's pass."""
+
+    def __init__(self, config: DSOMConfig, rng: np.random.Generator) -> None:
+        self.config = config
+        self.environment = EnvironmentEncoder(config, rng)
+        self.scan = PolarScanEncoder(config, rng) if config.encoder == "polar" else PaperScanEncoder(config, rng)
+        self.decoder = Decoder(config, rng)
+        # Sharpness of a softmax over SIM itself, used by the auxiliary loss only.
+        self.log_temperature = nnx.Param(jnp.full((), math.log(10.0), jnp.float32))
+
+    def observation(self, ranges: Array, lidar: LidarConfig, conditions: Conditions | None = None) -> Array:
+        """What the scan encoder reads of one scan (B,): polar features (A, C) or the scan image (size, size)."""
+        if self.config.encoder == "polar":
+            return polar_features(ranges, lidar, self.config, conditions)
+        limit = jnp.minimum(self.config.range_max, lidar.range_max if conditions is None else conditions.reach)
+        ranges = jnp.where(ranges < limit, ranges, jnp.inf)
+        return scan_image(ranges, lidar, self.config.resolution, self.config.scan_size)
+
+    def decode(self, features: Array, indices: tuple[Array, ...], observations: Array) -> Outputs:
+        """Eq 1, 3 and 4 for features (N, h, w, D) of N maps and observations (N, S, ...)."""
+        n, s = observations.shape[:2]
+        scan = self.scan(observations.reshape(n * s, *observations.shape[2:]))
+        similarity = cosine_similarity(scan.reshape(n, s, *scan.shape[1:]), features[:, None])
+        return Outputs(self.decoder(similarity, indices), similarity * jnp.exp(self.log_temperature[...]))
+
+    def __call__(self, occupied: Array, observations: Array) -> Outputs:
+        """Maps (N, H, W), H and W multiples of 8, with observations (N, S, ...)."""
+        features, indices = self.environment(occupied)
+        return self.decode(features, indices, observations)
+
+
+def create(config: DSOMConfig, seed: int = 0) -> DSOM:
+    """A network with fresh weights, in training mode."""
+    return DSOM(config, np.random.default_rng(seed))
+
+
+def evaluation_view(model: DSOM) -> DSOM:
+    """The same weights, normalising with the stored statistics: what filters close over."""
+    return nnx.view(model, use_running_average=True)
+
+
+def encode_map(model: DSOM, occupied: Array, free: Array | None = None) -> MapFeatures:
+    """Environment features of one map at the network's resolution.
+
+    Args:
+        model: an evaluation view.
+        occupied: (H, W) bool, cells that stop rays; any H and W.
+        free: (H, W) bool, where the robot may stand; all that is not occupied if not given.
+    """
+    features, indices = model.environment(pad_to_multiple(occupied)[None])
+    free = ~occupied.astype(bool) if free is None else free
+    return MapFeatures(features[0], tuple(index[0] for index in indices), free)
+
+
+def masked_log_softmax(logits: Array, free: Array) -> Array:
+    """Log PM (..., H, W, K) from logits (..., H', W', K): -inf where ``free`` (..., H, W) is false, padding cut off."""
+    h, w = free.shape[-2:]
+    logits = jnp.where(free[..., None], logits[..., :h, :w, :], -jnp.inf)
+    return logits - jax.nn.logsumexp(logits, axis=(-3, -2, -1), keepdims=True)
+
+
+def log_probability_map(model: DSOM, features: MapFeatures, ranges: Array, lidar: LidarConfig) -> Array:
+    """Log PM (H, W, K) of one scan (B,) on one map, theta_k = -pi + k 2pi/K; zero probability off free space."""
+    observation = model.observation(ranges, lidar)
+    indices = tuple(index[None] for index in features.indices)
+    outputs = model.decode(features.features[None], indices, observation[None, None])
+    return masked_log_softmax(outputs.logits[0, 0], features.free)

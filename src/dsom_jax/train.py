@@ -1,0 +1,296 @@
+"""``python -m dsom_jax.train``: train DSOM on procedural buildings or on given maps; resumable."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import time
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import tyro
+import yaml
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from dsom_jax import checkpoint
+from dsom_jax.errors import UserError, run_cli
+from dsom_jax.nn import DSOM
+from dsom_jax.occupancy import OccupancyGrid, resample
+from dsom_jax.training.batches import PLAIN, make_batch
+from dsom_jax.training.evaluation import make_evaluation
+from dsom_jax.training.loop import (
+    TrainConfig,
+    TrainState,
+    averaged_model,
+    init_state,
+    late_start,
+    make_batches,
+    make_step,
+    world_source,
+)
+from dsom_jax.training.memory import keep_freed_memory
+from dsom_jax.training.options import override
+
+CALIBRATION_STEPS = 30
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Train DSOM.
+
+    Attributes:
+        config: YAML file with fields of TrainConfig that differ from the defaults.
+        maps: map.yaml files to train on, with random obstacles, in place of procedural buildings.
+        init: checkpoint whose weights to start from.
+        minutes: time to train; the number of steps is set after the first few.
+        steps: number of steps, in place of minutes.
+        out: folder for the checkpoint, the training state and metrics.jsonl.
+        resume: continue the run in the folder ``out``.
+        save_minutes: time between checkpoints.
+        save_steps: steps between checkpoints, in place of save_minutes.
+    """
+
+    config: Path | None = None
+    maps: tuple[Path, ...] = ()
+    init: Path | None = None
+    minutes: float = 40.0
+    steps: int | None = None
+    out: Path = Path("runs/dsom")
+    resume: bool = False
+    save_minutes: float = 3.0
+    save_steps: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.steps is not None and self.steps < 1:
+            raise UserError(f"--steps {self.steps}: give at least one step")
+        if self.steps is None and not self.minutes > 0:
+            raise UserError(f"--minutes {self.minutes}: give a positive time")
+
+
+def read_config(path: Path | None) -> TrainConfig:
+    """TrainConfig from a YAML file with some of its fields."""
+    if path is None:
+        return TrainConfig()
+    try:
+        given = yaml.safe_load(path.read_text()) or {}
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise UserError(f"{path}: cannot read the configuration ({error}); give a YAML file") from error
+    return override(TrainConfig(), given, str(path))
+
+
+def load_maps(paths: tuple[Path, ...], resolution: float) -> list[OccupancyGrid]:
+    """Maps at the network's resolution, each with free space."""
+    from dsom_jax.data.ros_map import load_ros_map
+
+    grids = [resample(load_ros_map(path), resolution) for path in paths]
+    for path, grid in zip(paths, grids, strict=True):
+        if not bool(grid.free.any()):
+            raise UserError(f"{path}: no free cell at {resolution:.3f} m per cell; give a map with free space")
+    return grids
+
+
+@dataclass
+class Run:
+    """A training run and its folder: state-*/ (to resume), metrics.jsonl, run.json, and the checkpoint itself."""
+
+    out: Path
+    config: TrainConfig
+    maps: tuple[str, ...]
+    total: int | None
+    seconds: float = 0.0
+
+    def record(self) -> dict[str, Any]:
+        """What run.json holds."""
+        return {"config": asdict(self.config), "maps": list(self.maps), "total": self.total, "seconds": self.seconds}
+
+    def write(self) -> None:
+        """Write run.json."""
+        checkpoint.write_json(self.out / "run.json", self.record())
+
+    def states(self) -> list[Path]:
+        """Folders of complete states, oldest first."""
+        return sorted(p for p in self.out.glob("state-*") if p.name[6:].isdigit())
+
+    def save(self, state: TrainState, metrics: dict[str, Any]) -> None:
+        """State and checkpoint; the two newest states stay."""
+        step = int(state.step)
+        checkpoint.save_state(self.out / f"state-{step:08d}", state)
+        self.write()
+        model, tag = averaged_model(self.config, state), f"weights-{step:08d}"
+        checkpoint.save(self.out, model, self.provenance(step, metrics), tag)
+        for old in self.states()[:-2]:
+            shutil.rmtree(old, ignore_errors=True)
+
+    def provenance(self, step: int, metrics: dict[str, Any]) -> dict[str, Any]:
+        """How the weights came about."""
+        data = list(self.maps) or "procedural buildings, dsom_jax.simulate.make_world"
+        facts = {"seed": self.config.seed, "commit": commit(), "data": data, "steps": step, "total": self.total}
+        effort = {"seconds": round(self.seconds, 1), "samples": self.samples(step)}
+        return {**facts, **effort, "metrics": metrics, "train": asdict(self.config)}
+
+    def samples(self, step: int) -> int:
+        """Scans seen after ``step`` steps."""
+        early, late = self.config.early, self.config.late
+        start = step if self.total is None else min(step, late_start(self.config, self.total))
+        return start * early.worlds * early.scans + (step - start) * late.worlds * late.scans
+
+
+def commit() -> str:
+    """Commit of the source, or unknown."""
+    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+
+
+def open_run(args: Arguments) -> Run:
+    """A new run in an empty folder, or the one to resume."""
+    path = args.out / "run.json"
+    if args.resume:
+        return resume_run(args, path)
+    if args.out.exists() and any(args.out.iterdir()):
+        raise UserError(f"{args.out}: not empty; add --resume to continue that run, or give another --out")
+    try:
+        args.out.mkdir(parents=True, exist_ok=True)
+        run = Run(args.out, read_config(args.config), tuple(str(p) for p in args.maps), args.steps)
+        run.write()
+    except OSError as error:
+        raise UserError(f"{args.out}: cannot write ({error.strerror}); give another --out") from error
+    return run
+
+
+def resume_run(args: Arguments, path: Path) -> Run:
+    """The run described by run.json."""
+    try:
+        record = json.loads(path.read_text())
+        config = override(TrainConfig(), record["config"], str(path))
+        run = Run(args.out, config, tuple(record["maps"]), record["total"], record["seconds"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UserError(f"{path}: no run to resume here ({error}); start without --resume") from error
+    if args.config is not None and read_config(args.config) != config:
+        raise UserError(f"{args.config}: differs from the run in {path}; resume without --config")
+    if args.steps is not None and run.total is not None and args.steps != run.total:
+        raise UserError(f"--steps {args.steps}: the run in {path} has {run.total}; resume without --steps")
+    return run
+
+
+def first_state(args: Arguments, run: Run) -> TrainState:
+    """The newest saved state, or a fresh one."""
+    if run.states():
+        return checkpoint.load_state(run.states()[-1], init_state(run.config))
+    if args.init is None:
+        return init_state(run.config)
+    model: DSOM = checkpoint.load(args.init)
+    if model.config != run.config.model:
+        raise UserError(f"{args.init}: field model is {model.config}, the run's is {run.config.model}; make them equal")
+    return init_state(run.config, model)
+
+
+def trim_log(path: Path, step: int) -> None:
+    """Drop what a killed run wrote to the log after its last saved state."""
+    lines = path.read_text().splitlines() if path.exists() else []
+    kept = [line for line in lines if line.endswith("}") and json.loads(line)["step"] <= step]
+    temporary = path.with_name(path.name + ".new")
+    temporary.write_text("".join(line + "\n" for line in kept))
+    temporary.replace(path)
+
+
+def held_out(run: Run, grids: list[OccupancyGrid]) -> Any:
+    """Evaluation on full-size buildings that training does not see."""
+    source = world_source(run.config, run.config.late, grids)
+    key = jax.random.key(2**31 - 1 - run.config.seed)
+    scans = replace(PLAIN, range_max=run.config.scan.range_max, beams=run.config.scan.beams)
+    batch = jax.jit(lambda k: make_batch(k, source, scans, 12, 8))(key)
+    return make_evaluation(batch, scans.lidar)
+
+
+class Trainer:
+    """The Python loop around the jitted step."""
+
+    def __init__(self, args: Arguments, run: Run) -> None:
+        self.args, self.run = args, run
+        grids = load_maps(tuple(Path(m) for m in run.maps), run.config.model.resolution) if run.maps else []
+        self.batches = make_batches(run.config, grids)
+        self.step = make_step(run.config)
+        self.evaluate = held_out(run, grids)
+        self.state = first_state(args, run)
+        self.saved_at = time.monotonic()
+        self.clock = time.monotonic()
+        trim_log(run.out / "metrics.jsonl", int(self.state.step))
+
+    def train(self, progress: Progress) -> dict[str, Any]:
+        """Steps until the end; returns the last evaluation."""
+        first = done = int(self.state.step)
+        task = progress.add_task("training", total=self.run.total, completed=done, note="compiling")
+        batch = self.batches(done, self.total())
+        with (self.run.out / "metrics.jsonl").open("a") as log:
+            while done < self.total():
+                self.state, metrics = self.step(self.state, batch, jnp.int32(self.total()))
+                done += 1
+                # The next batch is made while the step runs.
+                batch = self.batches(done, self.total())
+                values = {name: float(value) for name, value in metrics.items()}
+                rate = self.tick(done - first)
+                log.write(json.dumps({"step": done, **values, "seconds": round(self.run.seconds, 3)}) + "\n")
+                note = f"loss {values['total']:.3f}  KLD {values['kld']:.3f}  {rate:.0f} samples/s"
+                progress.update(task, completed=done, total=self.run.total, note=note)
+                if self.due(done):
+                    log.flush()
+                    self.save(progress)
+        return self.save(progress)
+
+    def total(self) -> int:
+        """Steps of the run; far away until calibrated."""
+        return self.run.total or 2**30
+
+    def tick(self, count: int) -> float:
+        """Account for the time of a step; with ``minutes`` decide on the number of steps. Returns samples/s."""
+        now = time.monotonic()
+        spent, self.clock = now - self.clock, now
+        self.run.seconds += spent
+        if self.run.total is None:
+            self.calibrate(count, now)
+        return self.run.config.early.worlds * self.run.config.early.scans / max(spent, 1e-9)
+
+    def calibrate(self, count: int, now: float) -> None:
+        """Number of steps that fit the minutes given, from the steps after compilation."""
+        if count == 5:
+            self.calibration_start = now
+        elif count == 5 + CALIBRATION_STEPS:
+            per_step = (now - self.calibration_start) / CALIBRATION_STEPS
+            left = 60 * self.args.minutes * 0.95 - self.run.seconds
+            self.run.total = max(count + int(left / per_step), count + 1)
+            self.run.write()
+
+    def due(self, done: int) -> bool:
+        """Whether to save now."""
+        if self.args.save_steps is not None:
+            return done % self.args.save_steps == 0
+        return time.monotonic() - self.saved_at > 60 * self.args.save_minutes
+
+    def save(self, progress: Progress) -> dict[str, Any]:
+        """Evaluate and save; the time it takes is not training time of a step but counts for the run."""
+        scores = self.evaluate(averaged_model(self.run.config, self.state))
+        self.run.save(self.state, scores)
+        progress.console.print(f"step {int(self.state.step)}: " + json.dumps(scores))
+        self.saved_at = time.monotonic()
+        return scores
+
+
+def main() -> None:
+    """Entry point."""
+    args = tyro.cli(Arguments, description=__doc__)
+    keep_freed_memory()
+    run = open_run(args)
+    columns = (TextColumn("{task.completed} / {task.total}"), BarColumn(), TextColumn("{task.fields[note]}"))
+    with Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn()) as progress:
+        Trainer(args, run).train(progress)
+
+
+if __name__ == "__main__":
+    run_cli(main)

@@ -1,0 +1,200 @@
+"""The training loop's device side: configuration, state, one jitted step. It is called from a plain Python loop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import nnx
+
+from dsom_jax.nn import DSOM, DSOMConfig, create
+from dsom_jax.occupancy import OccupancyGrid
+from dsom_jax.simulate.worlds import WorldConfig, make_world
+from dsom_jax.training.batches import Batch, ScanConfig, WorldSource, crop_source, make_batch, make_pool
+from dsom_jax.training.loss import Losses, dsom_losses
+from dsom_jax.training.target import make_target
+from dsom_jax.types import Array
+
+
+@dataclass(frozen=True)
+class StageConfig:
+    """Sizes of a batch.
+
+    Attributes:
+        cells: side of the square worlds, a multiple of 8.
+        worlds: buildings in a batch.
+        scans: scans in each building; they share one pass of the environment encoder.
+    """
+
+    cells: int = 64
+    worlds: int = 4
+    scans: int = 16
+
+    def __post_init__(self) -> None:
+        if self.cells % 8 or min(self.cells, self.worlds, self.scans) < 1:
+            raise ValueError(f"StageConfig: cells = {self.cells} must be a multiple of 8, worlds and scans positive")
+
+
+def _default_model() -> DSOMConfig:
+    """A network that promises what the default scans train it for."""
+    return DSOMConfig(fov_min=ScanConfig.fov_min, reach_min=ScanConfig.reach_min)
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Everything that determines a training run together with its number of steps.
+
+    Attributes:
+        model: the network.
+        scan: simulated scans.
+        world: procedural buildings (its ``cells`` and ``resolution`` are taken from the stage and the model).
+        early: small batches that most steps use.
+        late: full-size worlds that the last steps use.
+        late_share: share of the steps on ``late``.
+        learning_rate: peak of Adam's rate, warm-up then cosine decay to zero.
+        warmup: steps to the peak.
+        clip: largest norm of the gradient.
+        similarity_weight: weight of the cross-entropy on SIM beside Eq 5.
+        ema: decay of the averaged weights that are shipped.
+        seed: of weights and data.
+    """
+
+    model: DSOMConfig = field(default_factory=lambda: _default_model())
+    scan: ScanConfig = ScanConfig()
+    world: WorldConfig = WorldConfig()
+    early: StageConfig = StageConfig()
+    late: StageConfig = StageConfig(cells=128, worlds=1, scans=16)
+    late_share: float = 0.1
+    learning_rate: float = 1e-3
+    warmup: int = 100
+    clip: float = 5.0
+    similarity_weight: float = 1.0
+    ema: float = 0.995
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.model.fov_min < self.scan.fov_min - 1e-6 or self.model.reach_min < self.scan.reach_min - 1e-6:
+            raise ValueError("TrainConfig: model.fov_min and model.reach_min promise scans that scan.* does not draw")
+
+
+class TrainState(NamedTuple):
+    """All that a step changes; saved and restored, training continues bit for bit.
+
+    Attributes:
+        step: () int32, steps done.
+        params: weights.
+        stats: batch-norm statistics.
+        optimizer: moments of Adam.
+        average: exponential average of (params, stats).
+    """
+
+    step: Array
+    params: Any
+    stats: Any
+    optimizer: Any
+    average: Any
+
+
+def optimizer(config: TrainConfig) -> optax.GradientTransformation:
+    """Clip and Adam; the rate is applied by the step because the number of steps is not static."""
+    return optax.chain(optax.clip_by_global_norm(config.clip), optax.scale_by_adam())
+
+
+def learning_rate(config: TrainConfig, step: Array, total: Array) -> Array:
+    """Linear warm-up, then half a cosine down to zero at ``total``."""
+    progress = jnp.clip((step - config.warmup) / jnp.maximum(total - config.warmup, 1), 0.0, 1.0)
+    warm = jnp.minimum((step + 1) / max(config.warmup, 1), 1.0)
+    return config.learning_rate * warm * 0.5 * (1 + jnp.cos(jnp.pi * progress))
+
+
+def split_model(model: DSOM) -> tuple[Any, Any, Any]:
+    """Graph definition, pure params and pure batch statistics."""
+    graphdef, params, stats = nnx.split(model, nnx.Param, nnx.BatchStat)
+    return graphdef, nnx.as_pure(params), nnx.as_pure(stats)
+
+
+def init_state(config: TrainConfig, model: DSOM | None = None) -> TrainState:
+    """State before the first step, from fresh weights or those of ``model``."""
+    _, params, stats = split_model(create(config.model, config.seed) if model is None else model)
+    # The average gets buffers of its own: the step donates all of the state.
+    average = jax.tree.map(jnp.copy, (params, stats))
+    return TrainState(jnp.zeros((), jnp.int32), params, stats, optimizer(config).init(params), average)
+
+
+def averaged_model(config: TrainConfig, state: TrainState) -> DSOM:
+    """The network that is shipped: averaged weights, evaluation view."""
+    graphdef = split_model(nnx.eval_shape(lambda: create(config.model)))[0]
+    return nnx.view(nnx.merge(graphdef, *state.average), use_running_average=True)
+
+
+def batch_losses(model: DSOM, batch: Batch, config: TrainConfig) -> Losses:
+    """Losses of a batch under a training view."""
+    observe = partial(model.observation, lidar=config.scan.lidar)
+    observations = jax.vmap(jax.vmap(lambda r, c: observe(r, conditions=c)))(batch.ranges, batch.conditions)
+    outputs = model(batch.occupied, observations)
+    shape = (batch.free.shape[1], batch.free.shape[2])
+    target = make_target(batch.poses, shape, config.model.headings, config.model.resolution)
+    return dsom_losses(outputs, target, batch.free, config.similarity_weight)
+
+
+def make_step(config: TrainConfig) -> Callable[[TrainState, Batch, Array], tuple[TrainState, dict[str, Array]]]:
+    """The jitted step: (state, batch, total steps) -> (state, metrics). The state given is consumed."""
+    graphdef = split_model(nnx.eval_shape(lambda: create(config.model)))[0]
+    transform = optimizer(config)
+
+    def objective(params: Any, stats: Any, batch: Batch) -> tuple[Array, tuple[Losses, Any]]:
+        model = nnx.merge(graphdef, params, stats)
+        losses = batch_losses(model, batch, config)
+        return losses.total, (losses, nnx.as_pure(nnx.state(model, nnx.BatchStat)))
+
+    def step(state: TrainState, batch: Batch, total: Array) -> tuple[TrainState, dict[str, Array]]:
+        (_, (losses, stats)), gradient = jax.value_and_grad(objective, has_aux=True)(state.params, state.stats, batch)
+        update, moments = transform.update(gradient, state.optimizer, state.params)
+        rate = learning_rate(config, state.step, total)
+        params = jax.tree.map(lambda p, u: p - rate * u, state.params, update)
+        # Early on the average follows faster, so that it does not remember the fresh weights.
+        decay = jnp.minimum(config.ema, (1.0 + state.step) / (10.0 + state.step))
+        average = jax.tree.map(lambda a, b: decay * a + (1 - decay) * b, state.average, (params, stats))
+        metrics = {**losses._asdict(), "rate": rate, "gradient": optax.global_norm(gradient)}
+        return TrainState(state.step + 1, params, stats, moments, average), metrics
+
+    return jax.jit(step, donate_argnums=0, compiler_options=compiler_options())
+
+
+def compiler_options() -> dict[str, str]:
+    """YNNPACK's convolutions use one thread; without them XLA's own use all, twice as fast on two cores."""
+    if jax.default_backend() != "cpu":
+        return {}
+    return {"xla_cpu_experimental_ynn_fusion_type": "LIBRARY_FUSION_TYPE_DOT"}
+
+
+def world_source(config: TrainConfig, stage: StageConfig, grids: list[OccupancyGrid] | None = None) -> WorldSource:
+    """Procedural buildings, or crops of ``grids``, which have the model's resolution."""
+    if grids:
+        return crop_source(make_pool(grids, stage.cells), stage.cells, config.model.resolution)
+    world = WorldConfig(**{**vars(config.world), "cells": stage.cells, "resolution": config.model.resolution})
+    return partial(make_world, config=world)
+
+
+def make_batches(config: TrainConfig, grids: list[OccupancyGrid] | None = None) -> Callable[[int, int], Batch]:
+    """(step, total) -> batch of that step: a function of the seed and the step alone, so that it can be resumed."""
+    root = jax.random.key(config.seed + 1)
+
+    def stage_maker(stage: StageConfig) -> Callable[[Array], Batch]:
+        source = world_source(config, stage, grids)
+        return jax.jit(
+            lambda step: make_batch(jax.random.fold_in(root, step), source, config.scan, stage.worlds, stage.scans)
+        )
+
+    early, late = stage_maker(config.early), stage_maker(config.late)
+    return lambda step, total: (late if step >= late_start(config, total) else early)(jnp.int32(step))
+
+
+def late_start(config: TrainConfig, total: int) -> int:
+    """First step on full-size worlds."""
+    return total - round(config.late_share * total)

@@ -1,0 +1,36 @@
+"""Configurations from plain mappings (YAML, JSON), with errors that name the field."""
+
+from __future__ import annotations
+
+from dataclasses import fields, is_dataclass, replace
+from typing import Any
+
+from dsom_jax.errors import UserError
+
+
+def override(config: Any, given: Any, where: str) -> Any:
+    """The frozen dataclass ``config`` with the fields of the mapping ``given``; nested ones alike."""
+    if not isinstance(given, dict):
+        raise UserError(f"{where}: expected fields of {type(config).__name__}, got {given!r}")
+    values = {}
+    for name, value in given.items():
+        if name not in {f.name for f in fields(config)}:
+            known = ", ".join(f.name for f in fields(config))
+            raise UserError(f"{where}: unknown field {name}; {type(config).__name__} has {known}")
+        old = getattr(config, name)
+        values[name] = (override if is_dataclass(old) else convert)(old, value, f"{where}: {name}")
+    try:
+        return replace(config, **values)
+    except (TypeError, ValueError) as error:
+        raise UserError(f"{where}: {error}") from error
+
+
+def convert(old: Any, value: Any, where: str) -> Any:
+    """``value`` as the type of ``old``: numbers, text, booleans and tuples of numbers."""
+    if isinstance(old, tuple) and isinstance(value, list):
+        return tuple(value)
+    if isinstance(old, float) and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if type(old) is not type(value):
+        raise UserError(f"{where}: expected {type(old).__name__} like {old!r}, got {value!r}")
+    return value
