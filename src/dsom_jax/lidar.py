@@ -39,7 +39,7 @@ class LidarConfig:
             raise ValueError(f"LidarConfig.beams = {self.beams}: give at least one beam")
         if not 0 <= self.range_min < self.range_max or not math.isfinite(self.range_max):
             raise ValueError(f"LidarConfig: need 0 <= range_min < range_max, got {self.range_min}, {self.range_max} m")
-        if abs(self.angle_min) > 2 * math.pi + 1e-3 or self.beams * abs(self.angle_increment) > 2 * math.pi * 1.01:
+        if abs(self.angle_min) > 2 * math.pi + 1e-3 or (self.beams - 1) * abs(self.angle_increment) > 2 * math.pi * 1.01:
             raise ValueError("LidarConfig: beams span more than a turn. Did you pass degrees instead of radians?")
 
     @property
@@ -81,15 +81,18 @@ def apply_limits(ranges: Array, lidar: LidarConfig) -> Array:
 
 
 def observe(key: Key, ranges: Array, lidar: LidarConfig, noise: LidarNoise) -> Array:
-    """Noisy scan (..., B) of a clean one: early returns, then Gaussian noise, then dropout, then limits."""
+    """Noisy scan (..., B) of a clean one: early returns, then Gaussian noise, then dropout, then limits.
+
+    What is invalid (NaN) or too close (-inf) already stays so.
+    """
     k_short, k_where, k_noise, k_drop = jax.random.split(key, 4)
     reach = jnp.minimum(ranges, lidar.range_max)
     early = reach * jax.random.uniform(k_where, ranges.shape)
-    ranges = jnp.where(jax.random.uniform(k_short, ranges.shape) < noise.short, early, ranges)
+    noisy = jnp.where(jax.random.uniform(k_short, ranges.shape) < noise.short, early, ranges)
     spread = noise.sigma + noise.sigma_relative * reach
-    ranges = ranges + spread * jax.random.normal(k_noise, ranges.shape)
-    ranges = jnp.where(jax.random.uniform(k_drop, ranges.shape) < noise.dropout, jnp.inf, ranges)
-    return apply_limits(ranges, lidar)
+    noisy = noisy + spread * jax.random.normal(k_noise, ranges.shape)
+    noisy = jnp.where(jax.random.uniform(k_drop, ranges.shape) < noise.dropout, jnp.inf, noisy)
+    return apply_limits(jnp.where(ranges > -jnp.inf, noisy, ranges), lidar)
 
 
 def scan_points(ranges: Array, lidar: LidarConfig) -> tuple[Array, Array]:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from dsom_jax.geometry import compose, relative
 from dsom_jax.types import Array
+
+_ROUNDING = 1e-6  # cells; edges of old and new cells closer than this are the same edge
 
 
 @jax.tree_util.register_dataclass
@@ -61,9 +65,9 @@ def from_cells(
 
 
 def cell_index(grid: OccupancyGrid, poses: Array) -> tuple[Array, Array]:
-    """Cells (i, j) of map-frame poses (..., 3); outside of the grid they lie outside of its shape."""
-    local = grid.to_grid(poses)
-    cells = jnp.floor(local[..., :2] / grid.resolution).astype(jnp.int32)
+    """Cells (i, j) of map-frame poses (..., 3); outside of the grid, and for NaN, they lie outside of its shape."""
+    cells = jnp.floor(grid.to_grid(poses)[..., :2] / grid.resolution)
+    cells = jnp.where(jnp.isnan(cells), -1, cells).astype(jnp.int32)
     return cells[..., 1], cells[..., 0]
 
 
@@ -95,15 +99,15 @@ def resample(grid: OccupancyGrid, resolution: float) -> OccupancyGrid:
     A new cell is free if the old cell at its centre was free and no occupied cell touches it.
     """
     ratio = resolution / grid.resolution
-    rows, cols = (max(1, int(-(-n // ratio))) for n in grid.shape)
+    rows, cols = (max(1, math.ceil(n / ratio - _ROUNDING)) for n in grid.shape)
     occupied = _any_in_window(grid.occupied, rows, ratio, axis=0)
     occupied = _any_in_window(occupied, cols, ratio, axis=1)
-    i, j = jnp.meshgrid(_centres(rows, ratio, grid.shape[0]), _centres(cols, ratio, grid.shape[1]), indexing="ij")
+    i, j = np.ix_(_centres(rows, ratio, grid.shape[0]), _centres(cols, ratio, grid.shape[1]))
     return OccupancyGrid(occupied, grid.free[i, j] & ~occupied, grid.origin, float(resolution))
 
 
-def _centres(n: int, ratio: float, old: int) -> Array:
-    return jnp.minimum(jnp.floor((jnp.arange(n) + 0.5) * ratio).astype(jnp.int32), old - 1)
+def _centres(n: int, ratio: float, old: int) -> np.ndarray:
+    return np.minimum(np.floor((np.arange(n) + 0.5) * ratio + _ROUNDING).astype(int), old - 1)
 
 
 def _any_in_window(cells: Array, n: int, ratio: float, axis: int) -> Array:
@@ -111,9 +115,9 @@ def _any_in_window(cells: Array, n: int, ratio: float, axis: int) -> Array:
     cells = jnp.moveaxis(cells, axis, 0)
     old = cells.shape[0]
     counts = jnp.concatenate([jnp.zeros((1, *cells.shape[1:]), jnp.int32), jnp.cumsum(cells, 0, dtype=jnp.int32)])
-    start = jnp.floor(jnp.arange(n) * ratio + 1e-4).astype(jnp.int32)
-    stop = jnp.maximum(jnp.ceil((jnp.arange(n) + 1) * ratio - 1e-4).astype(jnp.int32), start + 1)
-    hit = counts[jnp.clip(stop, 0, old)] > counts[jnp.clip(start, 0, old)]
+    start = np.floor(np.arange(n) * ratio + _ROUNDING).astype(int)
+    stop = np.maximum(np.ceil(np.arange(1, n + 1) * ratio - _ROUNDING).astype(int), start + 1)
+    hit = counts[np.clip(stop, 0, old)] > counts[np.clip(start, 0, old)]
     return jnp.moveaxis(hit, 0, axis)
 
 
