@@ -23,6 +23,8 @@ class OdometryMotion:
         alpha4: translation noise from rotation, m^2 / rad^2.
         min_xy, min_theta: standard deviations (m, rad) added however little the robot moved; positive, so that
             particles never coincide and densities stay finite.
+        slip: probability that the reported translation is wrong altogether, and its true share uniform in [-1.2, 1.2]:
+            wheels that slip or are blocked, encoders that do not tell backward from forward.
     """
 
     alpha1: float = 0.2
@@ -31,10 +33,13 @@ class OdometryMotion:
     alpha4: float = 0.2
     min_xy: float = 0.02
     min_theta: float = 0.01
+    slip: float = 0.0
 
     def __post_init__(self) -> None:
         if min(self.alpha1, self.alpha2, self.alpha3, self.alpha4, self.min_xy, self.min_theta) < 0:
             raise ValueError("OdometryMotion: noise parameters cannot be negative")
+        if not 0 <= self.slip < 1:
+            raise ValueError(f"OdometryMotion.slip = {self.slip}: a probability below one")
 
     def spread(self, odometry: Array) -> tuple[Array, Array]:
         """Rotation-translation-rotation (3,) of an increment and the standard deviations (3,) of its parts."""
@@ -53,15 +58,27 @@ class OdometryMotion:
     def sample(self, key: Key, poses: Array, odometry: Array) -> Array:
         """One successor of each pose (..., 3)."""
         parts, sigma = self.spread(odometry)
-        k_parts, k_floor = jax.random.split(key)
+        k_parts, k_floor, k_slip = jax.random.split(key, 3)
         noise = jax.random.normal(k_parts, (*poses.shape[:-1], 3))
         first, travel, second = jnp.moveaxis(parts + sigma * noise, -1, 0)
+        travel = travel * self._share_driven(k_slip, travel.shape)
         step = jnp.stack([travel * jnp.cos(first), travel * jnp.sin(first), first + second], axis=-1)
         floor = self.min_xy * jax.random.normal(k_floor, (*poses.shape[:-1], 2))
         return compose(poses, step.at[..., :2].add(floor))
 
+    def _share_driven(self, key: Key, shape: tuple[int, ...]) -> Array:
+        """Share of the reported translation that was driven: one, but for slips."""
+        if self.slip == 0:
+            return jnp.ones(shape)
+        k_which, k_share = jax.random.split(key)
+        slipped = jax.random.uniform(k_which, shape) < self.slip
+        return jnp.where(slipped, jax.random.uniform(k_share, shape, minval=-1.2, maxval=1.2), 1.0)
+
     def log_prob(self, new_poses: Array, poses: Array, odometry: Array) -> Array:
-        """Log density (...) in 1 / (m^2 rad), Gaussian about the mean increment (first order in the noise)."""
+        """Log density (...) in 1 / (m^2 rad), Gaussian about the mean increment (first order in the noise).
+
+        Slips are left out: this serves to match particles, not to weigh them.
+        """
         parts, sigma = self.spread(odometry)
         error = relative(compose(poses, odometry), new_poses)
         ahead = wrap_angle(parts[0] - odometry[2])

@@ -1,12 +1,12 @@
 """AdaM robust: the Bayes filter of a robot that is carried away with a small probability at every update.
 
 x_t ~ (1 - eps) p(. | x_{t-1}, a) + eps U(free space) is sampled as an adaptive mixture: H particles by motion from the
-resampled set, L particles from the proposal q. Importance weights then follow and nothing has to be inherited:
+resampled set, L particles from the proposal q. Importance weights then follow, and nothing has to be inherited:
 
-    H: (1 - eps) p(z | x) / N_H        L: eps u(x) p(z | x) / (q(x) N_L)
+    H: (1 - eps) p(z | x) w / (r N_H)        L: eps u(x) p(z | x) / (q(x) N_L)
 
-The posterior mass of L is the probability of having just been moved, so that a redrawn place takes over only when
-the evidence outweighs eps. The start is the same mixture with all mass in L.
+with r the resampling distribution. The posterior mass of L is the probability of having just been moved, so that a
+redrawn place takes over only when the evidence outweighs eps. The start is the same mixture with all mass in L.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.scipy.special import logsumexp
 
-from dsom_jax.filters.common import Info as Info
-from dsom_jax.filters.common import describe
+from dsom_jax.filters.common import Info, describe
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.proposals.uniform import FreeSpace
 from dsom_jax.raycast import MapTables, cast_rays
@@ -33,25 +33,37 @@ class RobustConfig:
 
     Attributes:
         particles: N.
-        kidnap: eps, prior probability of being carried away per update.
-        low_min, low_max: least and greatest share of particles redrawn, followed by the probability of being lost.
-        beams: beams used for weighing.
-        flatten: share of the resampling distribution proportional to sqrt(w) in place of w (with the weight to match):
-            improbable places live on until several scans have spoken.
-        model: sensor model.
+        kidnap: eps, prior probability of being carried away between two updates.
+        low_min, low_max: least and greatest share of redrawn particles; in between it follows the probability of
+            being lost (the trust of the paper, for the set as a whole).
+        flatten: share of the resampling distribution that is proportional to sqrt(w) in place of w: improbable
+            places live on, at their true weight, until several scans have spoken.
+        model: log-likelihood of a scan.
     """
 
     particles: int = 500
     kidnap: float = 1e-5
     low_min: float = 0.1
     low_max: float = 0.5
-    flatten: float = 0.0
-    beam_step: int = 3
-    model: BeamModel = field(default_factory=lambda: BeamModel(sigma_hit=0.2, temper=1 / 5))
+    flatten: float = 0.3
+    model: BeamModel = BeamModel()
+
+    def __post_init__(self) -> None:
+        if self.particles < 1:
+            raise ValueError(f"particles = {self.particles}: give at least one")
+        if not 0 < self.kidnap < 1 or not 0 < self.low_min <= self.low_max < 1 or not 0 <= self.flatten < 1:
+            raise ValueError("RobustConfig: kidnap, low_min <= low_max and flatten are shares between 0 and 1")
 
 
 class RobustState(NamedTuple):
-    """Weighted set; ``log_weights`` (N,) are normalised, ``lost`` () is that of the last update."""
+    """Weighted particle set.
+
+    Attributes:
+        poses: (N, 3) map frame.
+        log_weights: (N,) logarithms of weights that sum to one.
+        lost: () probability that the reported place is wrong, after the last update.
+        updates: () number of updates made.
+    """
 
     poses: Array
     log_weights: Array
@@ -59,55 +71,93 @@ class RobustState(NamedTuple):
     updates: Array
 
 
+class Draw(NamedTuple):
+    """Poses (N, 3) of one component and log(prior density / (proposal density * number of draws)) (N,)."""
+
+    poses: Array
+    log_ratio: Array
+
+
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class AdamRobust:
-    """See the module's docstring."""
+    """Adaptive mixture particle filter with a kidnapping prior.
+
+    Attributes:
+        tables: the map.
+        space: uniform distribution over its free poses, u.
+        proposal: samplable observation model, q; wherever it has mass zero, the filter cannot find the robot anew.
+        lidar: beams that are used (static); ``beam_step`` - 1 beams of the scan are skipped between them (static).
+        motion: model of the drive (static).
+        config: static.
+    """
 
     tables: MapTables
     space: FreeSpace
     proposal: Proposal
     lidar: LidarConfig = field(metadata={"static": True})
+    beam_step: int = field(metadata={"static": True})
     motion: Motion = field(metadata={"static": True})
     config: RobustConfig = field(metadata={"static": True})
 
     def prepare(self, inputs: Inputs) -> Any:
+        """The proposal for this scan."""
         return self.proposal.prepare(inputs)
 
     def init(self, key: Key) -> RobustState:
+        """Uniform particles; the first update replaces them all."""
         n = self.config.particles
         poses, _ = self.space.sample(key, None, n)
         return RobustState(poses, jnp.full((n,), -jnp.log(n)), jnp.float32(1.0), jnp.int32(0))
 
     def step(self, key: Key, state: RobustState, inputs: Inputs, prepared: Any) -> tuple[RobustState, Info]:
-        c = self.config
-        k_res, k_move, k_low = jax.random.split(key, 3)
-        n = c.particles
-        first = state.updates == 0
-        share = jnp.clip(state.lost, c.low_min, c.low_max)
-        n_low = jnp.where(first, n, jnp.round(share * n)).astype(jnp.int32)
-        slot = jnp.arange(n)
-        low = slot < n_low
-        n_high = n - n_low
-        # resample
-        w = jnp.exp(state.log_weights)
-        r = (1 - c.flatten) * w
-        if c.flatten:
-            root = jnp.exp(0.5 * (state.log_weights - state.log_weights.max()))
-            r = r + c.flatten * root / root.sum()
-        pos = (jnp.maximum(slot - n_low, 0) + jax.random.uniform(k_res)) / jnp.maximum(n_high, 1)
-        anc = pick(jnp.cumsum(r), jnp.minimum(pos, 1.0))
-        corr = state.log_weights[anc] - jnp.log(r[anc])
-        high = self.motion.sample(k_move, state.poses[anc], inputs.odometry)
-        fresh, log_q = self.proposal.sample(k_low, prepared, n)
-        poses = jnp.where(low[:, None], fresh, high)
-        seen = inputs.ranges[:: c.beam_step]
-        ll = beam_log_likelihood(seen, cast_rays(self.tables, poses, self.lidar), c.model)
-        eps = jnp.where(first, 1.0, c.kidnap)
-        lw_low = jnp.log(eps) + self.space.log_density_value - log_q - jnp.log(jnp.maximum(n_low, 1))
-        lw_high = jnp.log1p(-c.kidnap) + corr - jnp.log(jnp.maximum(n_high, 1))
-        lw = jnp.where(low, lw_low, jnp.where(first, -jnp.inf, lw_high)) + ll
-        lw = lw - jax.scipy.special.logsumexp(lw)
-        w = jnp.exp(lw)
-        info = describe(poses, w, low.mean(), jnp.bool_(False))
-        return RobustState(poses, lw, info.lost, state.updates + 1), info
+        """One update."""
+        k_high, k_low = jax.random.split(key)
+        low = jnp.arange(self.config.particles) < self._redraws(state)
+        kept = self._keep(k_high, state, low, inputs)
+        redrawn = self._redraw(k_low, state, low, prepared)
+        # Weigh
+        poses = jnp.where(low[:, None], redrawn.poses, kept.poses)
+        log_weights = jnp.where(low, redrawn.log_ratio, kept.log_ratio) + self._evidence(poses, inputs)
+        total = logsumexp(log_weights)
+        dead = ~jnp.isfinite(total)
+        log_weights = jnp.where(dead, -jnp.log(self.config.particles), log_weights - total)
+        # Estimate
+        info = describe(poses, jnp.exp(log_weights), low.mean(), dead)
+        return RobustState(poses, log_weights, info.lost, state.updates + 1), info
+
+    def _redraws(self, state: RobustState) -> Array:
+        """N_L: everything at first, then as much as the filter doubts itself."""
+        share = jnp.clip(state.lost, self.config.low_min, self.config.low_max)
+        count = jnp.maximum(jnp.round(share * self.config.particles), 1)
+        return jnp.where(state.updates == 0, self.config.particles, count).astype(jnp.int32)
+
+    def _keep(self, key: Key, state: RobustState, low: Array, inputs: Inputs) -> Draw:
+        """H: resample systematically by r, move."""
+        k_resample, k_move = jax.random.split(key)
+        log_r = resampling_log_weights(state.log_weights, self.config.flatten)
+        count = jnp.maximum((~low).sum(), 1)
+        rank = jnp.maximum(jnp.cumsum(~low) - 1, 0)
+        ancestors = pick(jnp.cumsum(jnp.exp(log_r)), (rank + jax.random.uniform(k_resample)) / count)
+        poses = self.motion.sample(k_move, state.poses[ancestors], inputs.odometry)
+        log_ratio = jnp.log1p(-self.config.kidnap) + (state.log_weights - log_r)[ancestors] - jnp.log(count)
+        return Draw(poses, log_ratio)
+
+    def _redraw(self, key: Key, state: RobustState, low: Array, prepared: Any) -> Draw:
+        """L: draw from q; the whole mass of the prior at the first update, eps of it later."""
+        poses, log_q = self.proposal.sample(key, prepared, self.config.particles)
+        prior = jnp.where(state.updates == 0, 0.0, jnp.log(self.config.kidnap))
+        return Draw(poses, prior + self.space.log_density_value - log_q - jnp.log(low.sum()))
+
+    def _evidence(self, poses: Array, inputs: Inputs) -> Array:
+        """log p(z | x) (N,)."""
+        seen = inputs.ranges[:: self.beam_step]
+        return beam_log_likelihood(seen, cast_rays(self.tables, poses, self.lidar), self.config.model)
+
+
+def resampling_log_weights(log_weights: Array, flatten: float) -> Array:
+    """log r (N,): (1 - flatten) w + flatten sqrt(w) / sum(sqrt(w))."""
+    if flatten == 0:
+        return log_weights
+    root = 0.5 * log_weights
+    return jnp.logaddexp(jnp.log1p(-flatten) + log_weights, jnp.log(flatten) + root - logsumexp(root))

@@ -46,33 +46,33 @@ def needs_checkpoint(method: str) -> bool:
 
 @dataclass(frozen=True)
 class Settings:
-    """What all filters of a comparison share.
+    """What all filters of a comparison share; ``range_max`` of the sensor models follows the lidar.
 
     Attributes:
         particles: N.
         t_cut: T_cut of Alg 1.
         max_beams: beams used for weighing.
-        motion: model of the drive.
-        score: Eq 15, for the paper's filters.
-        beam: true log-likelihood, for AdaM robust.
-        grid: the likelihood grid.
-        robust: AdaM robust; its particles, beams and model are those above.
-        raycast: how the paper's filters get expected ranges.
-        robust_raycast: how AdaM robust gets them.
         seed: of what is random while a filter is built (the samples of Mixture MCL).
+        motion, score, raycast: drive, Eq 15 and expected ranges of the paper's filters.
+        grid: the likelihood grid.
+        robust, robust_motion, robust_raycast: AdaM robust; its ``particles`` are those above.
     """
 
     particles: int = 200
     t_cut: float = 0.6
     max_beams: int = 72
+    seed: int = 0
     motion: Motion = OdometryMotion()
     score: ScoreModel = ScoreModel()
-    beam: BeamModel = BeamModel(sigma_hit=0.2, temper=0.2)
-    grid: LikelihoodGridConfig = LikelihoodGridConfig()
-    robust: RobustConfig = RobustConfig()
     raycast: RaycastConfig = RaycastConfig("table")
+    grid: LikelihoodGridConfig = LikelihoodGridConfig()
+    robust: RobustConfig = RobustConfig(model=BeamModel(sigma_hit=0.15, temper=1 / 3))
+    robust_motion: Motion = OdometryMotion(0.1, 0.1, 0.1, 0.1, slip=0.1)
     robust_raycast: RaycastConfig = RaycastConfig("exact")
-    seed: int = 0
+
+
+REAL = Settings(particles=500, max_beams=60)
+"""What ``localize`` starts from."""
 
 
 def build_filter(
@@ -91,7 +91,8 @@ def build_filter(
     """
     algorithm, proposal = COMBINATIONS[name]
     settings = Settings(particles=particles, t_cut=t_cut)
-    return make_filter(algorithm, make_proposal(proposal, grid, lidar, settings, episode, checkpoint), grid, lidar, settings)
+    source = make_proposal(proposal, grid, lidar, settings, episode, checkpoint)
+    return make_filter(algorithm, source, grid, lidar, settings)
 
 
 def make_proposal(
@@ -106,7 +107,8 @@ def make_proposal(
     if name == "uniform":
         return free_space(grid)
     if name == "likelihood_grid":
-        return likelihood_grid(grid, lidar, replace(settings.grid, model=replace(settings.grid.model, range_max=lidar.range_max)))
+        model = replace(settings.grid.model, range_max=lidar.range_max)
+        return likelihood_grid(grid, lidar, replace(settings.grid, model=model))
     if name == "dsom":
         return dsom(checkpoint, grid, lidar)
     collected = dual_features(jax.random.key(settings.seed), grid, lidar, DualFeaturesConfig())
@@ -118,15 +120,15 @@ def make_filter(
 ) -> Filter:
     """Filter ``algorithm`` drawing from ``proposal``."""
     step = -(-lidar.beams // settings.max_beams)
-    used = lidar.every(step)
+    used, space = lidar.every(step), free_space(grid)
     if algorithm == "adam_robust":
-        model = replace(settings.beam, range_max=lidar.range_max)
-        config = replace(settings.robust, particles=settings.particles, beam_step=step, model=model)
+        model = replace(settings.robust.model, range_max=lidar.range_max)
+        robust = replace(settings.robust, particles=settings.particles, model=model)
         tables = make_tables(grid, settings.robust_raycast, lidar.range_max)
-        return AdamRobust(tables, free_space(grid), proposal, used, settings.motion, config)
+        return AdamRobust(tables, space, proposal, used, step, settings.robust_motion, robust)
     score = replace(settings.score, range_max=lidar.range_max)
     tables = make_tables(grid, settings.raycast, lidar.range_max)
-    world = World(tables, free_space(grid), used, step, settings.motion, score)
+    world = World(tables, space, used, step, settings.motion, score)
     config = FilterConfig(settings.particles)
     if algorithm == "mcl":
         return MCL(world, config)

@@ -1,0 +1,253 @@
+"""``python -m dsom_jax.localize``: does global localization work with this map and this log?"""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import jax
+import numpy as np
+import tyro
+from rich.progress import Progress
+
+from dsom_jax import checkpoint, metrics, report
+from dsom_jax.data import RawLog, load_log, load_ros_map, save_tum
+from dsom_jax.data.cut import segment_indices, splice, to_episode
+from dsom_jax.episode import Episode
+from dsom_jax.errors import UserError, run_cli
+from dsom_jax.filters.methods import REAL, Algorithm, Settings, make_filter, make_proposal
+from dsom_jax.lidar import LidarConfig, apply_limits
+from dsom_jax.montecarlo import Result, run, run_keys
+from dsom_jax.occupancy import OccupancyGrid, is_free
+from dsom_jax.types import Filter
+
+PROPOSALS = ("likelihood_grid", "dsom", "hybrid", "uniform", "dual_features")
+
+
+@dataclass(frozen=True)
+class Args:
+    """Cut a log into segments, start each without any prior, and tell how often the robot is found."""
+
+    map: Path
+    """ROS map_server YAML."""
+    log: Path
+    """CARMEN (.log, .clf, .gz), rosbag1, rosbag2 or mcap."""
+    out: Path
+    """Folder for summary.json and estimate.tum."""
+    reference: Path | None = None
+    """TUM trajectory of the base in the map frame; default: the log's own, where it has one."""
+    method: Literal["adam_robust", "adam", "mcl", "mixture_mcl"] = "adam_robust"
+    """Particle filter."""
+    proposal: Literal["likelihood_grid", "dsom", "hybrid", "uniform", "dual_features"] = "likelihood_grid"
+    """Where redrawn particles come from; `mcl` always draws uniformly."""
+    checkpoint: Path | None = None
+    """Folder of a trained network, for dsom and hybrid."""
+    particles: int = 500
+    """Particles per run."""
+    runs: int = 100
+    """Monte-Carlo runs of each segment."""
+    segments: int = 8
+    """Pieces of the log, each started anew."""
+    steps_per_segment: int = 60
+    """Updates in a segment; 0 cuts the log into contiguous pieces without rest."""
+    update_min_d: float = 0.25
+    """Metres driven between updates."""
+    update_min_a: float = 0.2
+    """Radians turned between updates."""
+    kidnap: bool = False
+    """Join each segment to the one half the log away, as an unnoticed kidnapping."""
+    t_cut: float = 0.6
+    """T_cut of Alg 1."""
+    laser_max_range: float = 25.0
+    """Metres; longer readings count as no return."""
+    max_beams: int = 60
+    """Beams used for weighing."""
+    seed: int = 0
+    """Seed of all randomness."""
+
+
+class Drive(NamedTuple):
+    """One episode to localize, and the log's stamps (T,) of its updates."""
+
+    episode: Episode
+    stamps: np.ndarray
+
+
+class Outcome(NamedTuple):
+    """Result of one drive and the seconds that it took (compilation excluded)."""
+
+    drive: Drive
+    result: Result
+    seconds: float
+
+
+def main() -> None:
+    """Command line."""
+    args = tyro.cli(Args, description=Args.__doc__)
+    check(args)
+    folder = report.output_folder(args.out)
+    grid = load_ros_map(args.map)
+    log = limited(load_log(args.log, reference=args.reference), args.laser_max_range)
+    for line in log.report.lines():
+        print(f"{args.log.name}: {line}")
+    drives = cut(log, args)
+    filter = build(args, grid, log.lidar, drives[0].episode)
+    with Progress(console=report.terminal(stderr=True)) as progress:
+        outcomes = localize(filter, progress.track(drives, description="segments"), args.runs, args.seed)
+    summary = summarize(outcomes, grid, args)
+    report.write_json(folder / "summary.json", summary)
+    save_estimate(folder / "estimate.tum", outcomes)
+    print_summary(summary)
+
+
+def check(args: Args) -> None:
+    """UserError for settings that mean nothing."""
+    for name in ("particles", "runs", "segments", "max_beams", "laser_max_range"):
+        if not getattr(args, name) > 0:
+            raise UserError(f"--{name.replace('_', '-')} {getattr(args, name)}: give a positive number")
+    if args.steps_per_segment and args.steps_per_segment < 6:
+        raise UserError(f"--steps-per-segment {args.steps_per_segment}: give at least 6, or 0 for the whole log")
+    if not 0 < args.t_cut < 1:
+        raise UserError(f"--t-cut {args.t_cut}: give a number between 0 and 1 (the paper uses 0.6)")
+    if args.proposal in ("dsom", "hybrid") and args.method != "mcl" and args.checkpoint is None:
+        raise UserError(f"--proposal {args.proposal}: give --checkpoint, the folder of a trained network")
+    if args.kidnap and args.segments < 2:
+        raise UserError(f"--segments {args.segments}: --kidnap joins two segments, give at least 2")
+
+
+def limited(log: RawLog, range_max: float) -> RawLog:
+    """The log with readings beyond ``range_max`` metres as no return."""
+    if range_max <= log.lidar.range_min:
+        raise UserError(f"--laser-max-range {range_max}: must exceed the lidar's range_min, {log.lidar.range_min} m")
+    lidar = replace(log.lidar, range_max=min(log.lidar.range_max, range_max))
+    return replace(log, lidar=lidar, ranges=np.asarray(apply_limits(log.ranges, lidar)))
+
+
+def cut(log: RawLog, args: Args) -> list[Drive]:
+    """Segments of the log; with ``--kidnap`` each is followed by the one half the log further."""
+    rows = segment_indices(
+        log, args.segments, args.steps_per_segment or None, args.update_min_d, args.update_min_a
+    )  # fmt: skip
+    pieces = [Drive(to_episode(log, row), log.stamps[row]) for row in rows]
+    if not args.kidnap:
+        return pieces
+    others = pieces[len(pieces) // 2 :] + pieces[: len(pieces) // 2]
+    return [
+        Drive(splice(a.episode, b.episode), np.concatenate([a.stamps, b.stamps]))
+        for a, b in zip(pieces, others, strict=True)
+    ]
+
+
+def build(args: Args, grid: OccupancyGrid, lidar: LidarConfig, episode: Episode) -> Filter:
+    """The filter that the arguments ask for."""
+    settings = replace(REAL, particles=args.particles, t_cut=args.t_cut, max_beams=args.max_beams, seed=args.seed)
+    network = None
+    if args.checkpoint is not None and args.method != "mcl":
+        network = checkpoint.load(args.checkpoint, lidar=lidar)
+    name = "uniform" if args.method == "mcl" else args.proposal
+    return make_filter(args.method, make_proposal(name, grid, lidar, settings, episode, network), grid, lidar, settings)
+
+
+def localize(filter: Filter, drives: Any, runs: int, seed: int) -> list[Outcome]:
+    """``runs`` Monte-Carlo repetitions of every drive, each drive in one call."""
+    outcomes: list[Outcome] = []
+    for number, drive in enumerate(drives):
+        keys = run_keys(seed, number, runs)
+        start = time.perf_counter()
+        result = jax.block_until_ready(run(filter, drive.episode, keys))
+        outcomes.append(Outcome(drive, result, time.perf_counter() - start))
+    if len(outcomes) == 1:
+        start = time.perf_counter()
+        jax.block_until_ready(run(filter, outcomes[0].drive.episode, run_keys(seed, 0, runs)))
+        return [outcomes[0]._replace(seconds=time.perf_counter() - start)]
+    return outcomes
+
+
+def estimates(outcome: Outcome, method: str) -> np.ndarray:
+    """(R, T, 3) answers of a filter: the heaviest cluster, or for the paper's filters the weighted mean."""
+    info = outcome.result.info
+    return np.asarray(info.cluster if method == "adam_robust" else info.mean)
+
+
+def summarize(outcomes: list[Outcome], grid: OccupancyGrid, args: Args) -> dict[str, Any]:
+    """``summary.json``: the keys of DESIGN section 5 and, beside them, every segment on its own."""
+    updates = sum(len(o.drive.stamps) for o in outcomes)
+    timed = outcomes[1:] or outcomes
+    head = {
+        "map": str(args.map), "log": str(args.log), "method": args.method, "proposal": args.proposal,
+        "particles": args.particles, "segments": args.segments, "runs": args.runs, "updates": updates,
+        "steps_per_segment": len(outcomes[0].drive.stamps), "seed": args.seed,
+        "ms_per_update": 1e3 * float(np.median([o.seconds / len(o.drive.stamps) for o in timed])),
+        "confident": float(np.mean([np.asarray(o.result.info.lost) < metrics.CONFIDENT for o in outcomes])),
+    }  # fmt: skip
+    if all(np.isnan(o.drive.episode.poses).all() for o in outcomes):
+        return head | {"reference": None}
+    judged = [judge(outcome, args.method) for outcome in outcomes]
+    scores = score(judged, "global", args.seed)
+    if args.kidnap:
+        scores["kidnap"] = score(judged, "kidnap", args.seed)
+    return head | scores | {"by_segment": [describe(o, j, grid) for o, j in zip(outcomes, judged, strict=True)]}
+
+
+def judge(outcome: Outcome, method: str) -> dict[str, tuple[metrics.Runs, np.ndarray]]:
+    """Metrics and metres driven until convergence (R,) of each phase."""
+    episode, poses = outcome.drive.episode, estimates(outcome, method)
+    truth, lost = np.asarray(episode.poses), np.asarray(outcome.result.info.lost)
+    judged = {}
+    for phase, parts in metrics.phases(episode.kidnapped).items():
+        for part in parts[:1]:
+            runs = metrics.measure(poses[:, part], truth[part], lost[:, part])
+            judged[phase] = runs, metrics.metres_travelled(runs.steps, np.asarray(episode.odometry)[part])
+    return judged
+
+
+def score(judged: list[dict[str, tuple[metrics.Runs, np.ndarray]]], phase: str, seed: int) -> dict[str, Any]:
+    """All runs of one phase together."""
+    metres = np.concatenate([j[phase][1] for j in judged])
+    known = metres[~np.isnan(metres)]
+    median = float(np.median(known)) if len(known) else math.nan
+    return metrics.summarize(metrics.pool([j[phase][0] for j in judged]), seed) | {"metres_median": median}
+
+
+def describe(outcome: Outcome, judged: dict[str, Any], grid: OccupancyGrid) -> dict[str, Any]:
+    """One segment: where it starts in the log, how much of it lies on mapped free space, how often it succeeded."""
+    runs = judged["global"][0]
+    poses = outcome.drive.episode.poses
+    known = ~np.isnan(np.asarray(poses)).any(-1)
+    return {
+        "start_stamp": float(outcome.drive.stamps[0]),
+        "on_map": float(np.asarray(is_free(grid, poses))[known].mean()) if known.any() else None,
+        "converged": float((runs.steps >= 0).mean()),
+        "strict_success": float(metrics.strict_success(runs).mean()),
+        "e_pos_m_median": float(np.median(runs.e_pos)),
+    }
+
+
+def save_estimate(path: Path, outcomes: list[Outcome]) -> None:
+    """Heaviest cluster of run 0 at every update, in log time; of overlapping segments the earlier one counts."""
+    stamps = np.concatenate([o.drive.stamps for o in outcomes])
+    poses = np.concatenate([np.asarray(o.result.info.cluster)[0] for o in outcomes])
+    stamps, first = np.unique(stamps, return_index=True)
+    save_tum(path, stamps, poses[first])
+
+
+def print_summary(summary: dict[str, Any]) -> None:
+    """One line for a person."""
+    if "converged" not in summary:
+        print(f"{summary['updates']} updates, confident in {summary['confident']:.1%} of them; no reference to judge by")
+        return
+    for name, part in (("start", summary), ("kidnapping", summary.get("kidnap"))):
+        if part:
+            print(
+                f"{name}: converged {part['converged']:.1%} after {part['steps_median']:g} updates (median), "
+                f"retention {part['retention']:.2%}, strict success {part['strict_success']:.1%}, "
+                f"median final error {part['e_pos_m_median']:.3f} m"
+            )
+    print(f"{summary['ms_per_update']:.1f} ms per update of all {summary['runs']} runs")
+
+
+if __name__ == "__main__":
+    run_cli(main)
