@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -18,7 +18,7 @@ from dsom_jax.data import RawLog, load_log, load_ros_map, save_tum
 from dsom_jax.data.cut import segment_indices, splice, to_episode
 from dsom_jax.episode import Episode
 from dsom_jax.errors import UserError, run_cli
-from dsom_jax.filters.methods import REAL, Algorithm, Settings, make_filter, make_proposal
+from dsom_jax.filters.methods import REAL, make_filter, make_proposal
 from dsom_jax.lidar import LidarConfig, apply_limits
 from dsom_jax.montecarlo import Result, run, run_keys
 from dsom_jax.occupancy import OccupancyGrid, is_free
@@ -237,7 +237,9 @@ def save_estimate(path: Path, outcomes: list[Outcome]) -> None:
 def print_summary(summary: dict[str, Any]) -> None:
     """One line for a person."""
     if "converged" not in summary:
-        print(f"{summary['updates']} updates, confident in {summary['confident']:.1%} of them; no reference to judge by")
+        print(
+            f"{summary['updates']} updates, confident in {summary['confident']:.1%} of them; no reference to judge by"
+        )
         return
     for name, part in (("start", summary), ("kidnapping", summary.get("kidnap"))):
         if part:

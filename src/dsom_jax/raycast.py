@@ -7,7 +7,7 @@ edges of obstacles, where the ray from the pose and the one from the centre of i
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Literal
 
@@ -32,11 +32,14 @@ class RaycastConfig:
             the nearest of ``angles`` directions, would meet, and intersects the actual ray with that wall.
         angles: directions per cell of the table.
         max_skip: side of the largest empty square stored, cells.
+        surface: how deep in an occupied cell the beam is returned, cells. 0 for worlds whose cells are solid; 0.5 for
+            maps made from scans, whose end points lie anywhere in the cells that they fill.
     """
 
     method: Literal["exact", "table"] = "exact"
     angles: int = 360
-    max_skip: int = 31
+    max_skip: int = 63
+    surface: float = 0.0
 
     def __post_init__(self) -> None:
         if self.method not in ("exact", "table"):
@@ -54,23 +57,27 @@ class MapTables:
         grid: the map.
         squares: (4, H + 2, W + 2) uint8, side of the largest empty square whose corner is the cell and that extends
             to -x-y, +x-y, -x+y, +x+y; zero on occupied cells and on a border one cell wide around the map.
-        walls: (H, W, A) int16 or None, first wall from the centre of the cell: 2 * coordinate + axis, -1 for none.
+        walls: (H, W, A) int16 or None, first wall from the centre of the cell: 2 * coordinate + axis, -1 for none,
+            -2 on occupied cells.
         range_max: metres up to which ``walls`` was computed (static).
+        surface: metres added to the distance of the near edge of an occupied cell (static).
     """
 
     grid: OccupancyGrid
     squares: Array
     walls: Array | None
     range_max: float = field(metadata={"static": True})
+    surface: float = field(metadata={"static": True})
 
 
+@partial(jax.jit, static_argnames=("config", "range_max"))
 def make_tables(grid: OccupancyGrid, config: RaycastConfig, range_max: float) -> MapTables:
-    """Tables for :func:`cast_rays` up to ``range_max`` metres; jit-able."""
+    """Tables for :func:`cast_rays` up to ``range_max`` metres."""
     squares = empty_squares(jnp.pad(grid.occupied, 1, constant_values=True), config.max_skip)
-    tables = MapTables(grid, squares, None, range_max)
+    tables = MapTables(grid, squares, None, range_max, config.surface * grid.resolution)
     if config.method == "exact":
         return tables
-    return MapTables(grid, squares, _first_walls(tables, config.angles), range_max)
+    return replace(tables, walls=_first_walls(tables, config.angles))
 
 
 def empty_squares(blocked: Array, cap: int) -> Array:
@@ -105,7 +112,7 @@ def cast_rays(tables: MapTables, poses: Array, lidar: LidarConfig) -> Array:
         reach = march(tables.squares, x, y, *_directions(sensor[..., 2], bearings), limit)
     else:
         reach = _meet_walls(tables.walls, x, y, sensor[..., 2], bearings)
-    return jnp.where(reach < limit, reach * tables.grid.resolution, jnp.inf)
+    return jnp.where(reach < limit, reach * tables.grid.resolution + tables.surface, jnp.inf)
 
 
 def _directions(theta: Array, bearings: Array) -> tuple[Array, Array]:
@@ -185,7 +192,10 @@ def _on_border(squares: Array, x: Array, y: Array, dx: Array, dy: Array, reach: 
 
 
 def _first_walls(tables: MapTables, angles: int) -> Array:
-    """(H, W, A) int16 walls seen from cell centres: 2 * coordinate of the cell edge hit + (0 across x, 1 across y)."""
+    """(H, W, A) int16 walls seen from cell centres: 2 * coordinate of the cell edge hit + (0 across x, 1 across y).
+
+    -1 for none; -2 on occupied cells, from which everything is at distance zero.
+    """
     height, width = tables.grid.shape
     theta = jnp.arange(angles) * (2 * jnp.pi / angles)
     dx, dy = jnp.cos(theta), jnp.sin(theta)
@@ -197,7 +207,8 @@ def _first_walls(tables: MapTables, angles: int) -> Array:
         at_x, at_y = x + reach * dx, y + reach * dy
         across_y = jnp.abs(at_y - jnp.round(at_y)) < jnp.abs(at_x - jnp.round(at_x))
         edge = jnp.round(jnp.where(across_y, at_y, at_x))
-        return jnp.where(jnp.isfinite(reach), 2 * edge + across_y, -1).astype(jnp.int16)
+        walls = jnp.where(jnp.isfinite(reach), 2 * edge + across_y, -1).astype(jnp.int16)
+        return jnp.where(tables.grid.occupied[i.astype(jnp.int32), :, None], jnp.int16(-2), walls)
 
     return jax.lax.map(one_row, jnp.arange(height), batch_size=16)
 
@@ -214,4 +225,5 @@ def _meet_walls(walls: Array, x: Array, y: Array, theta: Array, bearings: Array)
     across_y = (wall & 1) == 1
     gap = (wall >> 1).astype(jnp.float32) - jnp.where(across_y, y, x)
     reach = jnp.maximum(gap / jnp.where(across_y, dy, dx), 0.0)
-    return jnp.where(known & (wall >= 0), reach, jnp.inf)
+    reach = jnp.where(wall == -2, 0.0, reach)
+    return jnp.where(known & (wall != -1), reach, jnp.inf)

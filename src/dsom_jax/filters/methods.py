@@ -71,7 +71,16 @@ class Settings:
     robust_raycast: RaycastConfig = RaycastConfig("exact")
 
 
-REAL = Settings(particles=500, max_beams=60)
+_SCANNED = 0.5
+"""Where, in an occupied cell of a map made from scans, a beam is returned: on average in its middle."""
+
+REAL = Settings(
+    particles=500,
+    max_beams=60,
+    raycast=RaycastConfig("table", surface=_SCANNED),
+    robust_raycast=RaycastConfig("exact", surface=_SCANNED),
+    grid=LikelihoodGridConfig(raycast=RaycastConfig("exact", surface=_SCANNED)),
+)
 """What ``localize`` starts from."""
 
 

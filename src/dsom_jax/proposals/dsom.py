@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import jax
@@ -48,5 +49,11 @@ def dsom(model: DSOM, grid: OccupancyGrid, lidar: LidarConfig) -> DSOMProposal:
     """Proposal of an evaluation view of a network, on a map resampled to the network's scale."""
     scaled = grid if abs(grid.resolution - model.config.resolution) < 1e-4 else resample(grid, model.config.resolution)
     graph, weights = nnx.split(model)
-    features = encode_map(model, scaled.occupied, scaled.free)
-    return DSOMProposal(nnx.as_pure(weights), features, pg.over(scaled, model.config.headings), graph, lidar)
+    weights = nnx.as_pure(weights)
+    features = _features(graph, weights, scaled)
+    return DSOMProposal(weights, features, pg.over(scaled, model.config.headings), graph, lidar)
+
+
+@partial(jax.jit, static_argnames="graph")
+def _features(graph: Any, weights: Any, grid: OccupancyGrid) -> MapFeatures:
+    return encode_map(nnx.merge(graph, weights), grid.occupied, grid.free)

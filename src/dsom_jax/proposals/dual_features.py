@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +27,6 @@ class DualFeaturesConfig:
         samples: scans collected in the map, over ``layouts`` draws of ``obstacles`` random obstacles each.
         bandwidth: standard deviation of the Gaussian kernel on the features, metres.
         headings: K of the grid that the samples are laid on.
-        beams: beams used for the features.
     """
 
     samples: int = 20_000
@@ -34,7 +34,6 @@ class DualFeaturesConfig:
     obstacles: int = 20
     bandwidth: float = 0.3
     headings: int = 32
-    beams: int = 72
 
 
 @jax.tree_util.register_dataclass
@@ -87,21 +86,21 @@ def scan_features(ranges: Array, lidar: LidarConfig) -> Array:
 
 def dual_features(key: Key, grid: OccupancyGrid, lidar: LidarConfig, config: DualFeaturesConfig) -> DualFeatures:
     """Proposal from scans simulated in the test map with random obstacles (Mixture MCL of the paper)."""
-    pose_grid = pg.over(grid, config.headings)
-    count = config.samples // config.layouts
-
-    @jax.jit
-    def collect(key: Key) -> tuple[Array, Array]:
-        k_things, k_pose = jax.random.split(key)
-        cluttered = add_obstacles(k_things, grid, config.obstacles)
-        poses, _ = free_space(cluttered).sample(k_pose, None, count)
-        ranges = cast_rays(make_tables(cluttered, RaycastConfig("exact"), lidar.range_max), poses, lidar)
-        return jax.vmap(lambda r: scan_features(r, lidar))(ranges), flat_cells(pose_grid, poses)
-
-    parts = [collect(k) for k in jax.random.split(key, config.layouts)]
+    parts = [_collect(k, grid, lidar, config) for k in jax.random.split(key, config.layouts)]
     features, cells = (jnp.concatenate(part) for part in zip(*parts, strict=True))
     never = jnp.full(len(cells), -1, jnp.int32)
-    return DualFeatures(features, cells, never, grid.free, pose_grid, lidar, config)
+    return DualFeatures(features, cells, never, grid.free, pg.over(grid, config.headings), lidar, config)
+
+
+@partial(jax.jit, static_argnames=("lidar", "config"))
+def _collect(key: Key, grid: OccupancyGrid, lidar: LidarConfig, config: DualFeaturesConfig) -> tuple[Array, Array]:
+    """Features (m, 3) and pose cells (m,) of random scans among one layout of random obstacles."""
+    k_things, k_pose = jax.random.split(key)
+    cluttered = add_obstacles(k_things, grid, config.obstacles)
+    poses, _ = free_space(cluttered).sample(k_pose, None, config.samples // config.layouts)
+    ranges = cast_rays(make_tables(cluttered, RaycastConfig("exact"), lidar.range_max), poses, lidar)
+    cells = flat_cells(pg.over(grid, config.headings), poses)
+    return jax.vmap(lambda r: scan_features(r, lidar))(ranges), cells
 
 
 def with_episode(proposal: DualFeatures, episode: Episode) -> DualFeatures:

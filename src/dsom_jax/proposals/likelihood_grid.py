@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +18,7 @@ from dsom_jax.sensor import BeamModel, beam_log_terms
 from dsom_jax.types import Array, Inputs, Key
 
 _LEVELS = 1024
+_BLOCK = 1024  # cells are counted in blocks, so that maps of like size share one compilation
 
 
 @dataclass(frozen=True)
@@ -28,6 +30,7 @@ class LikelihoodGridConfig:
         headings: K.
         angles_per_heading: directions of the range table per heading bin.
         beams: beams used, spread evenly over the scan.
+        raycast: how expected ranges are obtained.
         model: sensor model; its ``sigma_hit`` has to cover half a cell.
     """
 
@@ -35,6 +38,7 @@ class LikelihoodGridConfig:
     headings: int = 64
     angles_per_heading: int = 4
     beams: int = 60
+    raycast: RaycastConfig = RaycastConfig("exact")
     model: BeamModel = field(default_factory=lambda: BeamModel(sigma_hit=0.3))
 
 
@@ -85,12 +89,14 @@ def likelihood_grid(grid: OccupancyGrid, lidar: LidarConfig, config: LikelihoodG
     """Proposal for a map; casts C * A exact rays once."""
     coarse = resample_free(grid, config.resolution)
     pose_grid = pg.PoseGrid(grid.origin, *coarse.shape, config.headings, coarse.resolution)
-    cells = jnp.flatnonzero(coarse.free).astype(jnp.int32)
-    tables = make_tables(grid, RaycastConfig("exact"), config.model.range_max)
+    count = -(-int(coarse.free.sum()) // _BLOCK) * _BLOCK
+    cells = jnp.flatnonzero(coarse.free, size=count, fill_value=coarse.free.size).astype(jnp.int32)
+    tables = make_tables(grid, config.raycast, config.model.range_max)
     expected = _expected(tables, _viewpoints(grid, coarse, cells), config)
     return LikelihoodGrid(pose_grid, coarse.free, cells, expected, lidar, config)
 
 
+@partial(jax.jit, static_argnames="resolution")
 def resample_free(grid: OccupancyGrid, resolution: float) -> OccupancyGrid:
     """Coarser cells that are free where *any* of their old cells is; no finer than the map itself."""
     factor = max(1, round(resolution / grid.resolution))
@@ -100,34 +106,34 @@ def resample_free(grid: OccupancyGrid, resolution: float) -> OccupancyGrid:
     return OccupancyGrid(~free, free, grid.origin, grid.resolution * factor)
 
 
+@jax.jit
 def _viewpoints(grid: OccupancyGrid, coarse: OccupancyGrid, cells: Array) -> Array:
     """(C, 2) metres in the grid's frame: centre of the free old cell nearest to the centre of each new cell."""
     factor = round(coarse.resolution / grid.resolution)
     rows, cols = coarse.shape
     free = pad(grid, (rows * factor, cols * factor)).free
-    blocks = free.reshape(rows, factor, cols, factor).swapaxes(1, 2).reshape(rows * cols, factor, factor)[cells]
+    blocks = free.reshape(rows, factor, cols, factor).swapaxes(1, 2).reshape(rows * cols, factor, factor)
     offset = jnp.arange(factor) - (factor - 1) / 2
-    far = jnp.where(blocks, offset[:, None] ** 2 + offset**2, jnp.inf).reshape(len(cells), -1)
+    far = jnp.where(blocks[cells], offset[:, None] ** 2 + offset**2, jnp.inf).reshape(len(cells), -1)
     best = jnp.argmin(far, -1)
     j = (cells % cols) * factor + best % factor
     i = (cells // cols) * factor + best // factor
     return (jnp.stack([j, i], -1) + 0.5) * grid.resolution
 
 
+@partial(jax.jit, static_argnames="config")
 def _expected(tables: MapTables, points: Array, config: LikelihoodGridConfig) -> Array:
     """(A, C) uint16 ranges from ``points`` (C, 2) at A directions from -pi on, in the grid's frame."""
     angles = config.headings * config.angles_per_heading
-    rays = LidarConfig(beams=1, range_max=config.model.range_max)
+    ray = LidarConfig(beams=1, angle_min=0.0, range_max=config.model.range_max)
     step = (_LEVELS - 1) / config.model.range_max
 
-    @jax.jit
-    def at_angle(a: Array) -> Array:
-        heading = jnp.full(len(points), 2 * jnp.pi / angles) * a
-        poses = tables.grid.from_grid(jnp.concatenate([points, heading[:, None]], -1))
-        ranges = cast_rays(tables, poses, rays)[:, 0]
+    def along(heading: Array) -> Array:
+        local = jnp.concatenate([points, jnp.broadcast_to(heading, (len(points), 1))], -1)
+        ranges = cast_rays(tables, tables.grid.from_grid(local), ray)[:, 0]
         return jnp.round(jnp.minimum(ranges * step, _LEVELS - 1)).astype(jnp.uint16)
 
-    return jnp.stack([at_angle(a) for a in jnp.arange(angles, dtype=jnp.float32)])
+    return jax.lax.map(along, jnp.arange(angles) * (2 * jnp.pi / angles) - jnp.pi)
 
 
 def beam_choice(beams: int, wanted: int) -> np.ndarray:

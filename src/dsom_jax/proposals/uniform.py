@@ -50,6 +50,7 @@ class FreeSpace:
         return frame.from_grid(local), jnp.full((n,), self.log_density_value)
 
 
+@jax.jit
 def free_space(grid: OccupancyGrid) -> FreeSpace:
     """Uniform proposal over the free cells of ``grid``."""
     counts = jnp.cumsum(grid.free.reshape(-1).astype(jnp.float32))
