@@ -7,7 +7,9 @@ import math
 import numpy as np
 
 
-def ground_truth(pose: tuple[float, float, float], shape: tuple[int, int], headings: int, resolution: float) -> np.ndarray:
+def ground_truth(
+    pose: tuple[float, float, float], shape: tuple[int, int], headings: int, resolution: float
+) -> np.ndarray:
     """GT (H, W, K): a 7 x 7 Gaussian of 3 cells around the pose's cell, shared by the two nearest orientations."""
     x, y, theta = pose
     row, column = int(y // resolution), int(x // resolution)

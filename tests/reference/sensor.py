@@ -46,8 +46,14 @@ def beam_log(
 
 
 def field_log(
-    occupied: np.ndarray, resolution: float, ends: list[tuple[float, float]], z_hit: float, z_rand: float,
-    sigma: float, cut: float, top: float,
+    occupied: np.ndarray,
+    resolution: float,
+    ends: list[tuple[float, float]],
+    z_hit: float,
+    z_rand: float,
+    sigma: float,
+    cut: float,
+    top: float,
 ) -> float:
     """Sum of log-likelihoods of end points that lie exactly on cell centres (x, y), grid frame, metres."""
     total = 0.0
