@@ -73,7 +73,7 @@ class Style(NamedTuple):
 
 
 class Splits(NamedTuple):
-    """The 2^d nodes of one level of splits; node n has the label 2^d + n.
+    """One level d of splits; node n < 2^d has the label 2^d + n, further ones are padding.
 
     Attributes:
         split: (n,) bool, whether the node is split at all.
@@ -116,17 +116,27 @@ def room_labels(key: Key, style: Style, u: Array, v: Array, depth: int) -> tuple
 
 
 def _split(key: Key, style: Style, u: Array, v: Array, depth: int) -> tuple[Array, Array]:
-    """Labels (H, W) after all levels of splits, and which labels are corridors (2^(depth+1) + OVERLAYS,)."""
-    labels = jnp.ones(u.shape, jnp.int32)
-    boxes = jnp.stack([-style.half[0], style.half[0], -style.half[1], style.half[1]])[None]
-    alive = jnp.ones(1, bool)
-    corridors = [jnp.zeros(1, bool)]
-    for level, key_level in enumerate(jax.random.split(key, depth)):
-        splits = draw_splits(key_level, style, boxes, alive, level)
-        labels = _descend(labels, splits, u, v, level)
-        boxes, alive = _children(boxes, splits), jnp.repeat(splits.split, 2)
-        corridors.append(splits.corridor > 0)
-    return labels, jnp.concatenate([*corridors, jnp.zeros(2**depth + OVERLAYS, bool)])
+    """Labels (H, W) after all levels of splits, and which labels are corridors (2^(depth+1) + OVERLAYS,).
+
+    Loops rather than unrolled levels: XLA would fuse the splits into the cells and compute them anew for each.
+    """
+    nodes, levels = 2**depth, jnp.arange(depth)
+    whole = jnp.stack([-style.half[0], style.half[0], -style.half[1], style.half[1]])
+
+    def divide(carry: tuple[Array, Array], level_draws: tuple[Array, Array]) -> tuple[tuple[Array, Array], Splits]:
+        boxes, alive = carry
+        splits = draw_splits(level_draws[1], style, boxes, alive, level_draws[0])
+        return (_children(boxes, splits)[:nodes], jnp.repeat(splits.split, 2)[:nodes]), splits
+
+    start = jnp.broadcast_to(whole, (nodes, 4)), jnp.arange(nodes) == 0
+    _, splits = jax.lax.scan(divide, start, (levels, jax.random.uniform(key, (depth, 6, nodes))))
+
+    def descend(labels: Array, level_splits: tuple[Array, Splits]) -> tuple[Array, None]:
+        return _descend(labels, level_splits[1], u, v, 2 ** level_splits[0]), None
+
+    labels, _ = jax.lax.scan(descend, jnp.ones(u.shape, jnp.int32), (levels, splits))
+    per_level = [splits.corridor[level, : 2**level] > 0 for level in range(depth)]
+    return labels, jnp.concatenate([jnp.zeros(1, bool), *per_level, jnp.zeros(nodes + OVERLAYS, bool)])
 
 
 def inside_outline(style: Style, u: Array, v: Array) -> Array:
@@ -137,10 +147,8 @@ def inside_outline(style: Style, u: Array, v: Array) -> Array:
     return inside
 
 
-def draw_splits(key: Key, style: Style, boxes: Array, alive: Array, level: int) -> Splits:
-    """How the nodes of a level with extents ``boxes`` (n, 4) = (u0, u1, v0, v1) are split."""
-    n = boxes.shape[0]
-    r = jax.random.uniform(key, (6, n))
+def draw_splits(r: Array, style: Style, boxes: Array, alive: Array, level: Array) -> Splits:
+    """How the nodes of a level with extents ``boxes`` (n, 4) = (u0, u1, v0, v1) are split; ``r`` (6, n) uniform."""
     sides = jnp.stack([boxes[:, 1] - boxes[:, 0], boxes[:, 3] - boxes[:, 2]])
     width = style.corridor_width * (0.8 + 0.5 * r[0])
     # Corridors alternate in direction, so that each ends at the one before it; walls cut the longer side.
@@ -159,24 +167,23 @@ def draw_splits(key: Key, style: Style, boxes: Array, alive: Array, level: int) 
     return Splits(split, along_u, low + fraction * side, other, slope, jnp.where(split & corridor, width / 2, 0.0))
 
 
-def _cut_direction(style: Style, sides: Array, width: Array, chance: Array, level: int) -> tuple[Array, Array]:
+def _cut_direction(style: Style, sides: Array, width: Array, chance: Array, level: Array) -> tuple[Array, Array]:
     """Whether each node is cut at one u, and whether by a corridor; ``sides`` (2, n) metres."""
     root_along_u = style.half[0] < style.half[1]
-    alternate = root_along_u ^ bool(level % 2)
+    alternate = root_along_u ^ (level % 2 == 1)
     needed = 2 * style.room_size + width
     corridor = (level < style.corridor_levels) & (jnp.where(alternate, sides[0], sides[1]) > needed)
     longer = sides[0] * (0.75 + 0.5 * chance) > sides[1]
     return jnp.where(corridor, alternate, longer), corridor
 
 
-def _descend(labels: Array, splits: Splits, u: Array, v: Array, level: int) -> Array:
-    """Labels one level further down the tree; cells of a corridor keep the label of their node."""
-    first = 2**level
-    table = jnp.stack([value.astype(jnp.float32) for value in splits], axis=-1)
-    split, along_u, cut, centre, slope, corridor = jnp.moveaxis(table[jnp.clip(labels - first, 0, first - 1)], -1, 0)
-    across, along = (jnp.where(along_u > 0, *pair) for pair in ((u, v), (v, u)))
+def _descend(labels: Array, splits: Splits, u: Array, v: Array, first: Array) -> Array:
+    """Labels one level down, ``first`` that level's first label; corridor cells keep the label of their node."""
+    node = jnp.clip(labels - first, 0, first - 1)
+    split, along_u, cut, centre, slope, corridor = (value[node] for value in splits)
+    across, along = (jnp.where(along_u, *pair) for pair in ((u, v), (v, u)))
     side = across - cut - slope * (along - centre)
-    moves = (labels >= first) & (split > 0) & ~(jnp.abs(side) < corridor)
+    moves = (labels >= first) & split & ~(jnp.abs(side) < corridor)
     return jnp.where(moves, 2 * labels + (side > 0), labels)
 
 
@@ -194,8 +201,7 @@ def _lay_over(
 ) -> tuple[Array, Array]:
     """Shapes that ignore the splits: a ring corridor, round rooms, slanted halls."""
     first = is_corridor.shape[0] - OVERLAYS
-    for index, sub in enumerate(jax.random.split(key, OVERLAYS)):
-        r = jax.random.uniform(sub, (8,))
+    for index, r in enumerate(jax.random.uniform(key, (OVERLAYS, 8))):
         size = jnp.where(index == 0, 0.45 + 0.3 * r[0], 0.12 + 0.25 * r[0])
         half = jnp.maximum(size * style.half * (0.7 + 0.3 * r[1:3]), style.room_size)
         centre = (2 * r[3:5] - 1) * jnp.maximum(style.half - half, 0.0)

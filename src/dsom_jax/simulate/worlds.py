@@ -66,7 +66,7 @@ class WorldConfig:
         if not 0.05 <= self.resolution <= 0.5:
             raise ValueError(f"WorldConfig.resolution = {self.resolution}: give 0.05 to 0.5 metres per cell")
         if self.room_size[0] < 4 * self.resolution or self.corridor_width[0] < 4 * self.resolution:
-            raise ValueError("WorldConfig: rooms and corridors need at least 4 cells; make them larger or the cells finer")
+            raise ValueError("WorldConfig: rooms and corridors need at least 4 cells; use finer cells")
 
     @property
     def depth(self) -> int:
@@ -127,18 +127,16 @@ def cell_centres(config: WorldConfig) -> tuple[Array, Array]:
 
 def draw_style(key: Key, config: WorldConfig) -> Style:
     """The character of one building."""
-    k_shape, k_bend, k_rooms, k_things = jax.random.split(key, 4)
-    turn, half, notches = _draw_outline(k_shape, config)
-    r = jax.random.uniform(k_rooms, (12,))
+    shape, bend, r, t = jnp.split(jax.random.uniform(key, (40,)), (16, 23, 35))
+    turn, half, notches = _draw_outline(shape, config)
     levels = jnp.searchsorted(jnp.cumsum(jnp.asarray(config.corridors)), r[0] * 0.9999 * sum(config.corridors))
     # A sixth of the buildings with corridors are little else: their rooms are closed.
     mostly_closed = (levels > 0) & (r[1] < 1 / 6)
-    t = jax.random.uniform(k_things, (5,))
     return Style(
         turn=turn,
         half=half,
         notches=notches,
-        bend=_draw_bend(k_bend, config),
+        bend=_draw_bend(bend, config),
         corridor_levels=levels,
         corridor_width=_between(config.corridor_width, r[2] ** 1.5),
         room_size=_between(config.room_size, r[3] ** 1.5),
@@ -160,9 +158,8 @@ def _between(interval: tuple[float, float], fraction: Array) -> Array:
     return interval[0] + (interval[1] - interval[0]) * fraction
 
 
-def _draw_outline(key: Key, config: WorldConfig) -> tuple[Array, Array, Array]:
-    """Rotation, half extents (2,) and notches (3, 4) of the outline; the building fills most of the map."""
-    r = jax.random.uniform(key, (16,))
+def _draw_outline(r: Array, config: WorldConfig) -> tuple[Array, Array, Array]:
+    """Rotation, half extents (2,) and notches (3, 4) of the outline, from 16 uniform draws."""
     turn = jnp.where(r[0] < config.rotated, (2 * r[1] - 1) * jnp.pi / 4, 0.0)
     shape = jnp.stack([1.0, 0.45 + 0.55 * r[2]])
     shape = jnp.where(r[3] < 0.5, shape, shape[::-1])
@@ -177,9 +174,8 @@ def _draw_outline(key: Key, config: WorldConfig) -> tuple[Array, Array, Array]:
     return turn, half, jnp.where(present[:, None], notches, jnp.nan)
 
 
-def _draw_bend(key: Key, config: WorldConfig) -> Array:
-    """(5,) amplitude, wavelength and phase of curved walls, slope and place of a kink (see ``Style.bend``)."""
-    r = jax.random.uniform(key, (7,))
+def _draw_bend(r: Array, config: WorldConfig) -> Array:
+    """(5,) amplitude, wavelength and phase of curved walls, slope and place of a kink, from 7 uniform draws."""
     amplitude = jnp.where(r[0] < config.curved, 0.4 + 1.4 * r[1], 0.0)
     kink = jnp.where(r[4] < config.curved, 1.2 * (r[5] - 0.5), 0.0)
     place = (r[6] - 0.5) * config.cells * config.resolution / 2
