@@ -49,7 +49,7 @@ class Arguments:
         minutes: time to train; the number of steps is set after the first few.
         steps: number of steps, in place of minutes.
         out: folder for the checkpoint, the training state and metrics.jsonl.
-        resume: continue the run in the folder ``out``.
+        resume: continue the run in the folder ``out``, or start it if there is none yet.
         save_minutes: time between checkpoints.
         save_steps: steps between checkpoints, in place of save_minutes.
     """
@@ -151,9 +151,9 @@ def commit() -> str:
 def open_run(args: Arguments) -> Run:
     """A new run in an empty folder, or the one to resume."""
     path = args.out / "run.json"
-    if args.resume:
+    if args.resume and path.exists():
         return resume_run(args, path)
-    if args.out.exists() and any(args.out.iterdir()):
+    if not args.resume and args.out.exists() and any(args.out.iterdir()):
         raise UserError(f"{args.out}: not empty; add --resume to continue that run, or give another --out")
     try:
         args.out.mkdir(parents=True, exist_ok=True)
@@ -237,10 +237,10 @@ class Trainer:
                 values = {name: float(value) for name, value in metrics.items()}
                 rate = self.tick(done - first)
                 log.write(json.dumps({"step": done, **values, "seconds": round(self.run.seconds, 3)}) + "\n")
+                log.flush()
                 note = f"loss {values['total']:.3f}  KLD {values['kld']:.3f}  {rate:.0f} samples/s"
                 progress.update(task, completed=done, total=self.run.total, note=note)
                 if self.due(done):
-                    log.flush()
                     self.save(progress)
         return self.save(progress)
 
