@@ -44,16 +44,18 @@ class OdometryMotion:
     def spread(self, odometry: Array) -> tuple[Array, Array]:
         """Rotation-translation-rotation (3,) of an increment and the standard deviations (3,) of its parts."""
         travel = jnp.hypot(odometry[0], odometry[1])
-        first = jnp.where(travel < 0.01, 0.0, jnp.arctan2(odometry[1], odometry[0]))
-        second = wrap_angle(odometry[2] - first)
-        turn1, turn2 = (jnp.minimum(jnp.abs(r), jnp.abs(wrap_angle(r - jnp.pi))) for r in (first, second))
+        first = jnp.arctan2(odometry[1], odometry[0])
+        # The direction of less than a centimetre is no turn that could make noise (nav2).
+        turned = jnp.where(travel < 0.01, 0.0, first)
+        turns = turned, wrap_angle(odometry[2] - turned)
+        turn1, turn2 = (jnp.minimum(jnp.abs(r), jnp.abs(wrap_angle(r - jnp.pi))) for r in turns)
         by_travel = self.alpha2 * travel**2 + self.min_theta**2
         variances = (
             self.alpha1 * turn1**2 + by_travel,
             self.alpha3 * travel**2 + self.alpha4 * (turn1**2 + turn2**2) + self.min_xy**2,
             self.alpha1 * turn2**2 + by_travel,
         )
-        return jnp.stack([first, travel, second]), jnp.sqrt(jnp.stack(variances))
+        return jnp.stack([first, travel, wrap_angle(odometry[2] - first)]), jnp.sqrt(jnp.stack(variances))
 
     def sample(self, key: Key, poses: Array, odometry: Array) -> Array:
         """One successor of each pose (..., 3)."""

@@ -102,7 +102,7 @@ def _squares_into(blocked: Array, up: bool, right: bool, cap: int) -> Array:
 def cast_rays(tables: MapTables, poses: Array, lidar: LidarConfig) -> Array:
     """Expected ranges (..., B) in metres from map-frame base poses (..., 3); +inf beyond ``lidar.range_max``.
 
-    A pose outside of the map sees nothing, one on an occupied cell sees zeros.
+    A pose outside of the map sees nothing, one on an occupied cell sees ``surface`` (zero for solid cells).
     """
     sensor = tables.grid.to_grid(compose(poses, jnp.asarray(lidar.mount)))
     bearings = jnp.asarray(lidar.angles()) - lidar.mount[2]
@@ -112,7 +112,8 @@ def cast_rays(tables: MapTables, poses: Array, lidar: LidarConfig) -> Array:
         reach = march(tables.squares, x, y, *_directions(sensor[..., 2], bearings), limit)
     else:
         reach = _meet_walls(tables.walls, x, y, sensor[..., 2], bearings)
-    return jnp.where(reach < limit, reach * tables.grid.resolution + tables.surface, jnp.inf)
+    reach = reach * tables.grid.resolution + tables.surface
+    return jnp.where(reach < lidar.range_max, reach, jnp.inf)
 
 
 def _directions(theta: Array, bearings: Array) -> tuple[Array, Array]:
