@@ -1,4 +1,4 @@
-"""The log-likelihood of a scan at every pose of a grid, pose by pose and beam by beam, with bounds for rounded ranges."""
+"""The log-likelihood of a scan at a pose, beam by beam, with bounds for rounded ranges."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def bounds(
     rounding: float,
     model: dict[str, float],
 ) -> tuple[float, float, float]:
-    """Least, nominal and greatest log-likelihood at (x, y) in cells if each expected range is off by ``rounding`` metres.
+    """Least, nominal and greatest log-likelihood at (x, y) in cells if expected ranges are off by ``rounding`` m.
 
     A beam that passes a corner within 2e-3 cells may see anything from there on: it gets the widest bounds.
     """
