@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from reference import se2
 
 from dsom_jax import geometry
+from reference import se2
 
 PI = float(np.float32(np.pi))
 # float32 at coordinates of up to 100 m: 100 * 2^-24 per operation, about eight of them.

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from reference import se2
 
 from dsom_jax.lidar import LidarConfig, LidarNoise, apply_limits, observe, scan_image, scan_points
+from reference import se2
 
 FOUR = LidarConfig(beams=4, angle_min=-math.pi, angle_increment=math.pi / 2, range_max=10.0)  # back, right, ahead, left
 INF, NAN = np.inf, np.nan

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from reference import se2
 from scipy import ndimage
 
 from dsom_jax import occupancy
 from dsom_jax.occupancy import cell_index, from_cells, is_free
+from reference import se2
 
 L_SHAPE = np.array([[1, 0, 0, 0], [1, 0, 0, 0], [1, 1, 1, 0]], bool)  # row 0 is the lowest
 
