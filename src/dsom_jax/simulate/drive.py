@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +23,9 @@ from dsom_jax.types import Array, Key
 
 SPEED, TURN_RATE = 0.5, 0.8
 """Metres and radians per second of the simulated robot; only the stamps depend on them."""
+
+_add = jax.jit(add_obstacles, static_argnames=("count",))
+_remove = jax.jit(remove_structure, static_argnames=("count",))
 
 
 @dataclass(frozen=True)
@@ -117,19 +121,25 @@ def true_world(key: Key, grid: OccupancyGrid, poses: Array, config: DriveConfig)
     near = distance <= config.near
     k_add, k_remove = jax.random.split(key)
     where = near & ~keep & np.asarray(grid.free)
-    world = remove_structure(k_remove, grid, config.removed, where=jnp.asarray(near))
-    return add_obstacles(k_add, world, config.obstacles, where=jnp.asarray(where), keep=jnp.asarray(keep))
+    world = _remove(k_remove, grid, config.removed, where=jnp.asarray(near))
+    return _add(k_add, world, config.obstacles, where=jnp.asarray(where), keep=jnp.asarray(keep))
 
 
 def sense(key: Key, world: OccupancyGrid, poses: Array, config: DriveConfig) -> Array:
     """Noisy scans (T, B) of the true world."""
-    tables = make_tables(world, RaycastConfig("exact"), config.lidar.range_max)
-    return observe(key, cast_rays(tables, poses, config.lidar), config.lidar, config.lidar_noise)
+    return _scan(key, world, poses, config.lidar, config.lidar_noise)
+
+
+@partial(jax.jit, static_argnames=("lidar", "noise"))
+def _scan(key: Key, world: OccupancyGrid, poses: Array, lidar: LidarConfig, noise: LidarNoise) -> Array:
+    tables = make_tables(world, RaycastConfig("exact"), lidar.range_max)
+    return observe(key, cast_rays(tables, poses, lidar), lidar, noise)
 
 
 def measure(key: Key, before: Array, poses: Array, noise: OdometryMotion) -> Array:
     """Noisy increments (T, 3) between poses ``before`` and ``poses`` in the base frame; row 0 is zero."""
     increments = relative(before, poses)
+    # After a kidnapping the increment is the drive since the robot was put down: nothing gives the carrying away.
     keys = jax.random.split(key, len(increments))
     return jax.vmap(noise.sample, (0, None, 0))(keys, jnp.zeros(3), increments).at[0].set(0.0)
 

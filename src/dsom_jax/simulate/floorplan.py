@@ -196,9 +196,7 @@ def _children(boxes: Array, splits: Splits) -> Array:
     return jnp.stack([first, second], axis=1).reshape(-1, 4)
 
 
-def _lay_over(
-    key: Key, style: Style, labels: Array, is_corridor: Array, u: Array, v: Array
-) -> tuple[Array, Array]:
+def _lay_over(key: Key, style: Style, labels: Array, is_corridor: Array, u: Array, v: Array) -> tuple[Array, Array]:
     """Shapes that ignore the splits: a ring corridor, round rooms, slanted halls."""
     first = is_corridor.shape[0] - OVERLAYS
     for index, r in enumerate(jax.random.uniform(key, (OVERLAYS, 8))):

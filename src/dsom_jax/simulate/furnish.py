@@ -13,9 +13,7 @@ TILES = 32
 """Tiles repeat after this many along each axis; with tiles of a metre and more that is rooms away."""
 
 
-def furnish(
-    key: Key, style: Style, labels: Array, is_corridor: Array, wall: Array, u: Array, v: Array
-) -> Array:
+def furnish(key: Key, style: Style, labels: Array, is_corridor: Array, wall: Array, u: Array, v: Array) -> Array:
     """Cells (H, W) that furniture, pillars and shelves occupy; ``u``, ``v`` (H, W) metres in the building frame."""
     k_room, k_tile = jax.random.split(key)
     rooms = jax.random.uniform(k_room, (is_corridor.shape[0], 7))

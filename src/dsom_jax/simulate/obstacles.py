@@ -37,7 +37,7 @@ def add_obstacles(
     """
     cells = grid.free if where is None else where
     number = _bound(count, max_count)
-    covered = _draw_shapes(key, cells, jnp.arange(number) < count, tuple(s / grid.resolution for s in sizes))
+    covered = _draw_shapes(key, cells, jnp.arange(number) < count, sizes, grid.resolution)
     covered &= ~grid.occupied if keep is None else ~(grid.occupied | keep)
     return replace(grid, occupied=grid.occupied | covered, free=grid.free & clear_of(covered))
 
@@ -58,7 +58,7 @@ def remove_structure(
     """
     cells = grid.occupied if where is None else grid.occupied & where
     number = _bound(count, max_count)
-    gone = _draw_shapes(key, cells, jnp.arange(number) < count, tuple(s / grid.resolution for s in sizes))
+    gone = _draw_shapes(key, cells, jnp.arange(number) < count, sizes, grid.resolution)
     return replace(grid, occupied=grid.occupied & ~gone)
 
 
@@ -68,8 +68,9 @@ def _bound(count: Array | int, max_count: int | None) -> int:
     return int(count) if max_count is None else max_count
 
 
-def _draw_shapes(key: Key, cells: Array, present: Array, sizes: tuple[float, float]) -> Array:
-    """(H, W) bool, union of boxes and discs of ``sizes`` (cells) around random ``cells``, where ``present`` (n,)."""
+def _draw_shapes(key: Key, cells: Array, present: Array, sizes: tuple[float, float], resolution: float) -> Array:
+    """(H, W) bool, union of boxes and discs of ``sizes`` metres around random ``cells``, where ``present`` (n,)."""
+    sizes = sizes[0] / resolution, sizes[1] / resolution
     if not len(present):
         return jnp.zeros(cells.shape, bool)
     k_cell, k_shape = jax.random.split(key)
