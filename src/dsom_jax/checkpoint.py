@@ -109,7 +109,8 @@ def packages() -> dict[str, str]:
 
 
 def _weights(model: DSOM) -> dict[str, Any]:
-    _, params, stats = nnx.split(model, nnx.Param, nnx.BatchStat)
+    parts: Any = nnx.split(model, nnx.Param, nnx.BatchStat)
+    _, params, stats = parts
     return {"params": nnx.to_pure_dict(params), "stats": nnx.to_pure_dict(stats)}
 
 

@@ -114,7 +114,8 @@ def learning_rate(config: TrainConfig, step: Array, total: Array) -> Array:
 
 def split_model(model: DSOM) -> tuple[Any, Any, Any]:
     """Graph definition, pure params and pure batch statistics."""
-    graphdef, params, stats = nnx.split(model, nnx.Param, nnx.BatchStat)
+    parts: Any = nnx.split(model, nnx.Param, nnx.BatchStat)
+    graphdef, params, stats = parts
     return graphdef, nnx.as_pure(params), nnx.as_pure(stats)
 
 
