@@ -46,9 +46,8 @@ def training(config: TrainConfig, repeats: int) -> None:
     spent, samples = seconds(one, repeats), config.early.worlds * config.early.scans
     work = (compiled.cost_analysis() or {}).get("flops", float("nan")) / 1e9
     print(f"batch       {1e3 * seconds(lambda: batches(0, 1000), repeats):8.1f} ms")
-    print(
-        f"step        {1e3 * spent:8.1f} ms  {samples / spent:.1f} samples/s  {work / spent:.0f} GFLOP/s ({work:.0f} GFLOP)"
-    )
+    speed = f"{samples / spent:.1f} samples/s  {work / spent:.0f} GFLOP/s ({work:.0f} GFLOP)"
+    print(f"step        {1e3 * spent:8.1f} ms  {speed}")
 
 
 def inference(config: TrainConfig, repeats: int) -> None:
