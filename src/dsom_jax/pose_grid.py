@@ -116,8 +116,10 @@ def sample(key: Key, pm: ProbabilityMap, n: int) -> tuple[Array, Array]:
 
 
 def log_density(pm: ProbabilityMap, poses: Array) -> Array:
-    """Log density (...) of PM at map-frame poses (..., 3) in 1 / (m^2 rad); -inf off the grid."""
-    i, j, k = (jnp.round(v).astype(jnp.int32) for v in pose_cell(pm.pose_grid, poses))
+    """Log density (...) of PM at map-frame poses (..., 3) in 1 / (m^2 rad); -inf off the grid and for NaN."""
+    cells = pose_cell(pm.pose_grid, poses)
+    known = jnp.isfinite(poses).all(-1)
+    i, j, k = (jnp.round(jnp.where(known, v, -1)).astype(jnp.int32) for v in cells)
     on_grid = (i >= 0) & (i < pm.pose_grid.height) & (j >= 0) & (j < pm.pose_grid.width)
     cell = jnp.where(on_grid, i * pm.pose_grid.width + j, 0) * pm.pose_grid.headings + k % pm.pose_grid.headings
     mass = jnp.where(on_grid, pm.mass.reshape(-1)[cell], 0.0)
