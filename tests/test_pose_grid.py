@@ -102,7 +102,8 @@ def test_density_integrates_to_one_and_is_that_of_the_samples():
 def test_nothing_off_the_grid():
     pm = pg.probability_map(GRID, jnp.asarray(some_mass()))
     outside = pg.cell_pose(GRID, jnp.array([-0.6, 4.0, 2.0]), jnp.array([2.0, 2.0, 5.6]), jnp.zeros(3))
-    assert np.isneginf(pg.log_density(pm, outside)).all()
+    unknown = jnp.array([[np.nan, 4.0, 0.0], [-1.0, np.nan, 0.0], [-1.0, 4.0, np.nan]])
+    assert np.isneginf(pg.log_density(pm, jnp.concatenate([outside, unknown]))).all()
 
 
 def test_logarithms_lose_their_scale_and_cells_that_are_not_free():
