@@ -78,20 +78,22 @@ def _draw_shapes(key: Key, cells: Array, present: Array, sizes: tuple[float, flo
     i, j = flat // cells.shape[1], flat % cells.shape[1]
     reach = math.ceil(sizes[1] * math.sqrt(0.5)) + 1
     steps = jnp.arange(-reach, reach + 1)
-    inside = jax.vmap(lambda k: _shape(k, steps, sizes))(jax.random.split(k_shape, len(present)))
+    inside = _shapes(jax.random.uniform(k_shape, (6, len(present), 1, 1)), steps, sizes)
     inside &= (present & cells.any())[:, None, None]
     rows, columns = jnp.broadcast_arrays((i[:, None] + steps)[:, :, None], (j[:, None] + steps)[:, None, :])
     rows = jnp.where(inside & (rows >= 0) & (columns >= 0), rows, cells.shape[0])
     return jnp.zeros(cells.shape, bool).at[rows, columns].set(True, mode="drop")
 
 
-def _shape(key: Key, steps: Array, sizes: tuple[float, float]) -> Array:
-    """(n, n) bool, cells of one box (turned) or disc; ``steps`` (n,) cells from its middle cell, always covered."""
-    r = jax.random.uniform(key, (6,))
+def _shapes(r: Array, steps: Array, sizes: tuple[float, float]) -> Array:
+    """(n, m, m) bool, cells of n boxes (turned) and discs, from draws ``r`` (6, n, 1, 1).
+
+    ``steps`` (m,): cells from the middle cell, which is always covered.
+    """
     a, b = (sizes[0] + (sizes[1] - sizes[0]) * r[:2]) / 2
-    y, x = steps[:, None] + r[2] - 0.5, steps[None, :] + r[3] - 0.5
+    y, x = steps[:, None] + r[2] - 0.5, steps + r[3] - 0.5
     c, s = jnp.cos(jnp.pi * r[4]), jnp.sin(jnp.pi * r[4])
     box = (jnp.abs(c * x + s * y) < a) & (jnp.abs(c * y - s * x) < b)
     disc = x**2 + y**2 < a**2
-    middle = (steps == 0)[:, None] & (steps == 0)[None, :]
+    middle = (steps == 0)[:, None] & (steps == 0)
     return jnp.where(r[5] < 0.5, box, disc) | middle
