@@ -58,9 +58,9 @@ def test_a_traced_count_draws_the_first_of_many() -> None:
 
 
 def test_a_map_without_free_cells_gets_no_obstacles() -> None:
-    full = from_cells(jnp.ones((10, 10), bool), resolution=0.1)
-    assert not (~add_obstacles(jax.random.key(0), full, 5).occupied).any()
-    nowhere = add_obstacles(jax.random.key(0), EMPTY, 5, where=jnp.zeros(EMPTY.shape, bool))
+    full = from_cells(jnp.ones(EMPTY.shape, bool), resolution=0.1)
+    assert not (~add_obstacles(jax.random.key(0), full, 12).occupied).any()
+    nowhere = add_obstacles(jax.random.key(0), EMPTY, 12, where=jnp.zeros(EMPTY.shape, bool))
     assert not nowhere.occupied.any()
 
 
@@ -81,7 +81,7 @@ def test_removal_can_be_confined() -> None:
 
 def test_equal_keys_give_equal_obstacles_also_under_vmap() -> None:
     keys = jax.random.split(jax.random.key(6), 3)
-    batch = jax.vmap(lambda key: add_obstacles(key, EMPTY, 6).occupied)(keys)
+    batch = jax.vmap(lambda key: add_obstacles(key, EMPTY, 12).occupied)(keys)
     for key, cells in zip(keys, batch, strict=True):
-        np.testing.assert_array_equal(add_obstacles(key, EMPTY, 6).occupied, cells)
+        np.testing.assert_array_equal(add_obstacles(key, EMPTY, 12).occupied, cells)
     assert (batch[0] != batch[1]).any()

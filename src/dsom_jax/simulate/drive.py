@@ -136,6 +136,7 @@ def _scan(key: Key, world: OccupancyGrid, poses: Array, lidar: LidarConfig, nois
     return observe(key, cast_rays(tables, poses, lidar), lidar, noise)
 
 
+@partial(jax.jit, static_argnames=("noise",))
 def measure(key: Key, before: Array, poses: Array, noise: OdometryMotion) -> Array:
     """Noisy increments (T, 3) between poses ``before`` and ``poses`` in the base frame; row 0 is zero."""
     increments = relative(before, poses)
