@@ -150,6 +150,21 @@ def test_a_diagonal_gap_is_no_road() -> None:
     assert roads(from_cells(jnp.asarray(~free), resolution=0.3)).free.sum() == 9
 
 
+def test_fine_maps_are_planned_on_coarser_cells_that_are_free_throughout() -> None:
+    cells = np.zeros((120, 160), bool)
+    cells[[0, -1], :] = cells[:, [0, -1]] = True
+    cells[:70, 80] = True
+    grid = from_cells(jnp.asarray(cells), jnp.asarray(~cells).at[60:64, 20:24].set(False), resolution=0.05)
+    network = roads(grid)
+    assert network.resolution > grid.resolution
+    path = smooth(network, shortest_path(network, 0, len(network.cells) - 1))
+    poses = jnp.asarray(np.column_stack([path, np.zeros(len(path))]))
+    assert is_free(grid, poses).all()
+    j, i = np.floor(path / 0.05).astype(int).T
+    # A coarse cell of 0.15 m hides at most its diagonal of the clearance.
+    assert (ndimage.distance_transform_edt(~cells) * 0.05)[i, j].min() > 0.3 - 0.15 * np.sqrt(2)
+
+
 def test_maps_that_cannot_be_driven_are_refused() -> None:
     with pytest.raises(UserError, match="no free cell"):
         make_synthetic(0, from_cells(jnp.ones((20, 20), bool), resolution=0.3), CLEAN)

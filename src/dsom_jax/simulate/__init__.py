@@ -1,1 +1,15 @@
 """Simulated buildings, obstacles and drives."""
+
+from dsom_jax.simulate.drive import DriveConfig, make_synthetic
+from dsom_jax.simulate.obstacles import add_obstacles, remove_structure
+from dsom_jax.simulate.worlds import WorldConfig, make_world, make_worlds
+
+__all__ = [
+    "DriveConfig",
+    "WorldConfig",
+    "add_obstacles",
+    "make_synthetic",
+    "make_world",
+    "make_worlds",
+    "remove_structure",
+]

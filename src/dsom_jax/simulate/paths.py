@@ -10,10 +10,13 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
 from dsom_jax.errors import UserError
-from dsom_jax.occupancy import OccupancyGrid, resample
+from dsom_jax.occupancy import OccupancyGrid, from_cells, resample
 
 PLANNING_RESOLUTION = 0.15
 """Finer maps are planned on at this many metres per cell."""
+
+ROBOT_RADIUS = 0.3
+"""Least distance from the robot to the centre of an occupied cell, metres."""
 
 
 @dataclass(frozen=True)
@@ -46,13 +49,22 @@ class Roads:
 
 def roads(grid: OccupancyGrid) -> Roads:
     """Roads of a map."""
-    grid = grid if grid.resolution >= PLANNING_RESOLUTION else resample(grid, PLANNING_RESOLUTION)
-    labels, count = ndimage.label(np.asarray(grid.free))
+    occupied, free, resolution = _planning_cells(grid)
+    clearance = ndimage.distance_transform_edt(~occupied) * resolution
+    labels, count = ndimage.label(free & (clearance >= ROBOT_RADIUS))
     if not count:
-        raise UserError("the map has no free cell to drive on; check its thresholds and resolution")
+        raise UserError(f"the map has no free cell {ROBOT_RADIUS} m from a wall to drive on; check its thresholds")
     free = labels == 1 + np.argmax(np.bincount(labels.ravel())[1:])
-    clearance = ndimage.distance_transform_edt(~np.asarray(grid.occupied)) * grid.resolution
-    return Roads(free, np.argwhere(free), _graph(free, clearance, grid.resolution), grid.resolution)
+    return Roads(free, np.argwhere(free), _graph(free, clearance, resolution), resolution)
+
+
+def _planning_cells(grid: OccupancyGrid) -> tuple[np.ndarray, np.ndarray, float]:
+    """Occupied and free cells (H, W) to plan on, and metres per cell; a coarse cell is free if all of it is."""
+    if grid.resolution >= PLANNING_RESOLUTION:
+        return np.asarray(grid.occupied), np.asarray(grid.free), grid.resolution
+    coarse = resample(grid, PLANNING_RESOLUTION)
+    barred = resample(from_cells(~grid.free, resolution=grid.resolution), PLANNING_RESOLUTION).occupied
+    return np.asarray(coarse.occupied), ~np.asarray(barred), PLANNING_RESOLUTION
 
 
 def _graph(free: np.ndarray, clearance: np.ndarray, resolution: float) -> coo_array:
