@@ -18,7 +18,7 @@ LAYERS = (
     ("proposals", "metrics"),
     ("filters", "training", "montecarlo"),
     ("data", "checkpoint", "plotting", "report"),
-    ("train", "bench", "localize", "evaluate"),
+    ("cli", "train", "bench", "localize", "evaluate"),
 )
 DEVICE = 5
 """Layers below this are device code."""

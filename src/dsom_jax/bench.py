@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-import tyro
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from dsom_jax import metrics, plotting, report
 from dsom_jax.checkpoint import load as load_network
+from dsom_jax.cli import parse
 from dsom_jax.data.suite import Suite, load_suite
 from dsom_jax.episode import Episode
 from dsom_jax.errors import UserError, run_cli
@@ -262,7 +262,7 @@ def progress_bar(total: int) -> tuple[Progress, Advance]:
 
 def main() -> None:
     """Argument handling."""
-    args = tyro.cli(Args, prog="python -m dsom_jax.bench")
+    args = parse(Args, "python -m dsom_jax.bench")
     settings = Settings(args.runs, args.particles, args.t_cut, args.seed)
     methods = chosen_methods(args.methods, args.checkpoint)
     suite = load_suite(args.suite)

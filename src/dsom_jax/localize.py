@@ -10,10 +10,10 @@ from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
-import tyro
 from rich.progress import Progress
 
 from dsom_jax import checkpoint, metrics, report
+from dsom_jax.cli import parse
 from dsom_jax.data import RawLog, load_log, load_ros_map, save_tum
 from dsom_jax.data.cut import segment_indices, splice, to_episode
 from dsom_jax.episode import Episode
@@ -86,7 +86,7 @@ class Outcome(NamedTuple):
 
 def main() -> None:
     """Command line."""
-    args = tyro.cli(Args, description=Args.__doc__)
+    args = parse(Args, "python -m dsom_jax.localize")
     check(args)
     folder = report.output_folder(args.out)
     grid = load_ros_map(args.map)

@@ -12,11 +12,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import tyro
 import yaml
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from dsom_jax import checkpoint
+from dsom_jax.cli import parse
 from dsom_jax.errors import UserError, run_cli
 from dsom_jax.nn import DSOM
 from dsom_jax.occupancy import OccupancyGrid, resample
@@ -284,7 +284,7 @@ class Trainer:
 
 def main() -> None:
     """Entry point."""
-    args = tyro.cli(Arguments, description=__doc__)
+    args = parse(Arguments, "python -m dsom_jax.train")
     keep_freed_memory()
     run = open_run(args)
     columns = (TextColumn("{task.completed} / {task.total}"), BarColumn(), TextColumn("{task.fields[note]}"))
