@@ -88,13 +88,14 @@ def main() -> None:
     """Command line."""
     args = parse(Args, "python -m dsom_jax.localize")
     check(args)
-    folder = report.output_folder(args.out)
     grid = load_ros_map(args.map)
     log = limited(load_log(args.log, reference=args.reference), args.laser_max_range)
     for line in log.report.lines():
         print(f"{args.log.name}: {line}")
     drives = cut(log, args)
-    filter = build(args, grid, log.lidar, drives[0].episode)
+    network = load_network(args, log.lidar)
+    folder = report.output_folder(args.out)
+    filter = build(args, grid, log.lidar, drives[0].episode, network)
     with Progress(console=report.terminal(stderr=True)) as progress:
         outcomes = localize(filter, progress.track(drives, description="segments"), args.runs, args.seed)
     summary = summarize(outcomes, grid, args)
@@ -141,12 +142,16 @@ def cut(log: RawLog, args: Args) -> list[Drive]:
     ]
 
 
-def build(args: Args, grid: OccupancyGrid, lidar: LidarConfig, episode: Episode) -> Filter:
+def load_network(args: Args, lidar: LidarConfig) -> Any:
+    """The trained network that the arguments name, None without."""
+    if args.checkpoint is None or args.method == "mcl":
+        return None
+    return checkpoint.load(args.checkpoint, lidar=lidar)
+
+
+def build(args: Args, grid: OccupancyGrid, lidar: LidarConfig, episode: Episode, network: Any = None) -> Filter:
     """The filter that the arguments ask for."""
     settings = replace(REAL, particles=args.particles, t_cut=args.t_cut, max_beams=args.max_beams, seed=args.seed)
-    network = None
-    if args.checkpoint is not None and args.method != "mcl":
-        network = checkpoint.load(args.checkpoint, lidar=lidar)
     name = "uniform" if args.method == "mcl" else args.proposal
     return make_filter(args.method, make_proposal(name, grid, lidar, settings, episode, network), grid, lidar, settings)
 
