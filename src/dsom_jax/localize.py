@@ -109,6 +109,9 @@ def check(args: Args) -> None:
     for name in ("particles", "runs", "segments", "max_beams", "laser_max_range"):
         if not getattr(args, name) > 0:
             raise UserError(f"--{name.replace('_', '-')} {getattr(args, name)}: give a positive number")
+    for name in ("update_min_d", "update_min_a", "seed"):
+        if not getattr(args, name) >= 0:
+            raise UserError(f"--{name.replace('_', '-')} {getattr(args, name)}: must not be negative")
     if args.steps_per_segment and args.steps_per_segment < 6:
         raise UserError(f"--steps-per-segment {args.steps_per_segment}: give at least 6, or 0 for the whole log")
     if not 0 < args.t_cut < 1:
@@ -135,6 +138,11 @@ def cut(log: RawLog, args: Args) -> list[Drive]:
     rows = segment_indices(
         log, args.segments, args.steps_per_segment or None, args.update_min_d, args.update_min_a
     )  # fmt: skip
+    if rows.shape[1] < metrics.HOLD + 1:
+        raise UserError(
+            f"{log.path}: segments of {rows.shape[1]} updates are too short to judge, need {metrics.HOLD + 1}; "
+            "give a longer log, fewer --segments or smaller --update-min-d and --update-min-a"
+        )
     pieces = [Drive(to_episode(log, row), log.stamps[row]) for row in rows]
     if not args.kidnap:
         return pieces
