@@ -236,9 +236,9 @@ def describe(outcome: Outcome, judged: dict[str, Any], grid: OccupancyGrid) -> d
     return {
         "start_stamp": float(outcome.drive.stamps[0]),
         "on_map": float(np.asarray(is_free(grid, poses))[known].mean()) if known.any() else None,
-        "converged": float((runs.steps >= 0).mean()),
-        "strict_success": float(metrics.strict_success(runs).mean()),
-        "e_pos_m_median": float(np.median(runs.e_pos)),
+        "converged": metrics.ratio((runs.steps >= 0).sum(), len(runs.steps)),
+        "strict_success": metrics.ratio(metrics.strict_success(runs).sum(), len(runs.steps)),
+        "e_pos_m_median": float(np.median(runs.e_pos)) if len(runs.e_pos) else math.nan,
     }
 
 
