@@ -25,6 +25,8 @@ class OdometryMotion:
             particles never coincide and densities stay finite.
         slip: probability that the reported translation is wrong altogether, and its true share uniform in [-1.2, 1.2]:
             wheels that slip or are blocked, encoders that do not tell backward from forward.
+        tail: probability that the noise has ``tail_scale`` times its standard deviation: tyres on another floor.
+        tail_scale: that factor.
     """
 
     alpha1: float = 0.2
@@ -34,12 +36,15 @@ class OdometryMotion:
     min_xy: float = 0.02
     min_theta: float = 0.01
     slip: float = 0.0
+    tail: float = 0.0
+    tail_scale: float = 3.0
 
     def __post_init__(self) -> None:
         if min(self.alpha1, self.alpha2, self.alpha3, self.alpha4, self.min_xy, self.min_theta) < 0:
             raise ValueError("OdometryMotion: noise parameters cannot be negative")
-        if not 0 <= self.slip < 1:
-            raise ValueError(f"OdometryMotion.slip = {self.slip}: a probability below one")
+        for name, value in (("slip", self.slip), ("tail", self.tail)):
+            if not 0 <= value < 1:
+                raise ValueError(f"OdometryMotion.{name} = {value}: give a probability below one")
 
     def spread(self, odometry: Array) -> tuple[Array, Array]:
         """Rotation-translation-rotation (3,) of an increment and the standard deviations (3,) of its parts."""
@@ -60,12 +65,14 @@ class OdometryMotion:
     def sample(self, key: Key, poses: Array, odometry: Array) -> Array:
         """One successor of each pose (..., 3)."""
         parts, sigma = self.spread(odometry)
-        k_parts, k_floor, k_slip = jax.random.split(key, 3)
-        noise = jax.random.normal(k_parts, (*poses.shape[:-1], 3))
+        k_parts, k_floor, k_slip, k_tail = jax.random.split(key, 4)
+        wide = jax.random.uniform(k_tail, (*poses.shape[:-1], 1)) < self.tail
+        scale = jnp.where(wide, self.tail_scale, 1.0)
+        noise = scale * jax.random.normal(k_parts, (*poses.shape[:-1], 3))
         first, travel, second = jnp.moveaxis(parts + sigma * noise, -1, 0)
         travel = travel * self._share_driven(k_slip, travel.shape)
         step = jnp.stack([travel * jnp.cos(first), travel * jnp.sin(first), first + second], axis=-1)
-        floor = self.min_xy * jax.random.normal(k_floor, (*poses.shape[:-1], 2))
+        floor = scale * self.min_xy * jax.random.normal(k_floor, (*poses.shape[:-1], 2))
         return compose(poses, step.at[..., :2].add(floor))
 
     def _share_driven(self, key: Key, shape: tuple[int, ...]) -> Array:
@@ -79,7 +86,7 @@ class OdometryMotion:
     def log_prob(self, new_poses: Array, poses: Array, odometry: Array) -> Array:
         """Log density (...) in 1 / (m^2 rad), Gaussian about the mean increment (first order in the noise).
 
-        Slips are left out: this serves to match particles, not to weigh them.
+        Slips and the tail are left out: this serves to match particles, not to weigh them.
         """
         parts, sigma = self.spread(odometry)
         error = relative(compose(poses, odometry), new_poses)
