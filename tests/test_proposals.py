@@ -192,7 +192,7 @@ def test_star_knows_the_sequence_but_not_the_current_pose(features, episode):
     as_it_is = prepare(star, inputs(episode.ranges[t], t)).mass
     np.testing.assert_allclose(as_it_is, prepare(without, inputs(episode.ranges[t], 77)).mass, rtol=1e-4, atol=1e-6)
     # At any other time the same scan finds its own pose among the samples.
-    i, j, k = (int(round(float(v))) for v in pg.pose_cell(star.pose_grid, episode.poses[t]))
+    i, j, k = (round(float(v)) for v in pg.pose_cell(star.pose_grid, episode.poses[t]))
     later = prepare(star, inputs(episode.ranges[t], 6))
     assert later.mass[i, j, k % 16] / later.mass.sum() > as_it_is[i, j, k % 16] / as_it_is.sum() + 1e-4
 
