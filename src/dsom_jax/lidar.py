@@ -39,7 +39,8 @@ class LidarConfig:
             raise ValueError(f"LidarConfig.beams = {self.beams}: give at least one beam")
         if not 0 <= self.range_min < self.range_max or not math.isfinite(self.range_max):
             raise ValueError(f"LidarConfig: need 0 <= range_min < range_max, got {self.range_min}, {self.range_max} m")
-        if abs(self.angle_min) > 2 * math.pi + 1e-3 or (self.beams - 1) * abs(self.angle_increment) > 2 * math.pi * 1.01:
+        spanned = (self.beams - 1) * abs(self.angle_increment)
+        if abs(self.angle_min) > 2 * math.pi + 1e-3 or spanned > 2 * math.pi * 1.01:
             raise ValueError("LidarConfig: beams span more than a turn. Did you pass degrees instead of radians?")
 
     @property

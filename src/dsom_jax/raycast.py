@@ -153,9 +153,8 @@ def _march_flat(squares: Array, rays: list[Array], limit: float) -> Array:
         first = jnp.where(live.reshape(_GROUP, groups), order, _GROUP - 1).min(0)
         chosen = first * groups + jnp.arange(groups, dtype=jnp.int32)
         got, side = _leap(squares, [_at(v, chosen) for v in rays], _at(reach, chosen), _MORE_STEPS)
-        put = dict(mode="promise_in_bounds", unique_indices=True)
-        live = live.at[chosen].set((side > 0) & (got < limit), **put)
-        return reach.at[chosen].set(got, **put), live, count + 1
+        live = _put(live, chosen, (side > 0) & (got < limit))
+        return _put(reach, chosen, got), live, count + 1
 
     state = (reach, (side > 0) & (reach < limit), jnp.int32(0))
     return jax.lax.while_loop(lambda s: s[1].any() & (s[2] < rounds), one_per_group, state)[0]
@@ -163,6 +162,10 @@ def _march_flat(squares: Array, rays: list[Array], limit: float) -> Array:
 
 def _at(values: Array, index: Array) -> Array:
     return values.at[index].get(mode="promise_in_bounds")
+
+
+def _put(values: Array, index: Array, new: Array) -> Array:
+    return values.at[index].set(new, mode="promise_in_bounds", unique_indices=True)
 
 
 def _leap(squares: Array, rays: list[Array], reach: Array, steps: int) -> tuple[Array, Array]:
@@ -204,7 +207,7 @@ def _first_walls(tables: MapTables, angles: int) -> Array:
 
     def one_row(i: Array) -> Array:
         x, y = jnp.arange(width)[:, None] + 0.5, i + 0.5
-        reach = march(tables.squares, x, jnp.full((width, 1), y), *jnp.broadcast_arrays(dx, dy), limit)
+        reach = march(tables.squares, x, jnp.full((width, 1), y), dx, dy, limit)
         at_x, at_y = x + reach * dx, y + reach * dy
         across_y = jnp.abs(at_y - jnp.round(at_y)) < jnp.abs(at_x - jnp.round(at_x))
         edge = jnp.round(jnp.where(across_y, at_y, at_x))
