@@ -46,6 +46,7 @@ class RobustConfig:
     low_min: float = 0.1
     low_max: float = 0.5
     flatten: float = 0.3
+    caution: float = 0.5
     model: BeamModel = BeamModel()
 
     def __post_init__(self) -> None:
@@ -53,6 +54,8 @@ class RobustConfig:
             raise ValueError(f"particles = {self.particles}: give at least one")
         if not 0 < self.kidnap < 1 or not 0 < self.low_min <= self.low_max < 1 or not 0 <= self.flatten < 1:
             raise ValueError("RobustConfig: kidnap, low_min <= low_max and flatten are shares between 0 and 1")
+        if not 0 <= self.caution < 1:
+            raise ValueError(f"RobustConfig.caution = {self.caution}: give a share below one")
 
 
 class RobustState(NamedTuple):
@@ -118,7 +121,7 @@ class AdamRobust:
         redrawn = self._redraw(k_low, state, low, prepared)
         # Weigh
         poses = jnp.where(low[:, None], redrawn.poses, kept.poses)
-        log_weights = jnp.where(low, redrawn.log_ratio, kept.log_ratio) + self._evidence(poses, inputs)
+        log_weights = jnp.where(low, redrawn.log_ratio, kept.log_ratio) + self._evidence(state, poses, inputs)
         total = logsumexp(log_weights)
         dead = ~jnp.isfinite(total)
         log_weights = jnp.where(dead, -jnp.log(self.config.particles), log_weights - total)
@@ -149,10 +152,11 @@ class AdamRobust:
         prior = jnp.where(state.updates == 0, 0.0, jnp.log(self.config.kidnap))
         return Draw(poses, prior + self.space.log_density_value - log_q - jnp.log(low.sum()))
 
-    def _evidence(self, poses: Array, inputs: Inputs) -> Array:
-        """log p(z | x) (N,)."""
+    def _evidence(self, state: RobustState, poses: Array, inputs: Inputs) -> Array:
+        """log p(z | x) (N,), tempered further while the filter is lost."""
         seen = inputs.ranges[:: self.beam_step]
-        return beam_log_likelihood(seen, cast_rays(self.tables, poses, self.lidar), self.config.model)
+        evidence = beam_log_likelihood(seen, cast_rays(self.tables, poses, self.lidar), self.config.model)
+        return (1.0 - self.config.caution * state.lost) * evidence
 
 
 def resampling_log_weights(log_weights: Array, flatten: float) -> Array:

@@ -37,9 +37,9 @@ class LikelihoodGridConfig:
     resolution: float = 0.2
     headings: int = 64
     angles_per_heading: int = 4
-    beams: int = 60
+    beams: int = 180
     raycast: RaycastConfig = RaycastConfig("exact")
-    model: BeamModel = field(default_factory=lambda: BeamModel(sigma_hit=0.3))
+    model: BeamModel = field(default_factory=lambda: BeamModel(sigma_hit=0.2))
 
 
 @jax.tree_util.register_dataclass
