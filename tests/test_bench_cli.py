@@ -181,6 +181,7 @@ def test_default_methods_are_those_that_can_be_run(tmp_path):
 def test_bad_input_is_one_line_and_exit_code_2_before_any_work(suite, monkeypatch, tmp_path, capsys, words, field):
     (tmp_path / "FILE").touch()
     monkeypatch.setattr(bench, "collect", lambda *_: pytest.fail("work was begun"))
+    monkeypatch.setattr(bench.networks, "shipped", lambda: None)
     with pytest.raises(SystemExit) as stop:
         command(monkeypatch, *(word.replace("FILE", str(tmp_path / "FILE")) for word in words))
     error = capsys.readouterr().err

@@ -12,8 +12,8 @@ import jax
 import numpy as np
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from dsom_jax import checkpoint as networks
 from dsom_jax import metrics, plotting, report
-from dsom_jax.checkpoint import load as load_network
 from dsom_jax.cli import parse
 from dsom_jax.data.suite import Suite, load_suite
 from dsom_jax.episode import Episode
@@ -38,7 +38,7 @@ class Args:
     suite: str = "synthetic-v1"
     """Name of a suite, or a TOML file that describes one."""
     methods: str = ""
-    """Comma-separated method names; default: all, without --checkpoint all that need none."""
+    """Comma-separated method names; default: all, or all that need no network where none is shipped."""
     particles: int = 200
     """Particles per run."""
     t_cut: float = 0.6
@@ -48,7 +48,7 @@ class Args:
     out: Path | None = None
     """Folder for bench.json, bench.md and figures."""
     checkpoint: Path | None = None
-    """Folder of a trained DSOM."""
+    """Folder of a trained DSOM; default: the one in the repository."""
 
 
 @dataclass(frozen=True)
@@ -264,9 +264,10 @@ def main() -> None:
     """Argument handling."""
     args = parse(Args, "python -m dsom_jax.bench")
     settings = Settings(args.runs, args.particles, args.t_cut, args.seed)
-    methods = chosen_methods(args.methods, args.checkpoint)
+    checkpoint = args.checkpoint or networks.shipped()
+    methods = chosen_methods(args.methods, checkpoint)
     suite = load_suite(args.suite)
-    network = load_network(args.checkpoint, suite.lidar) if args.checkpoint else None
+    network = networks.load(checkpoint, suite.lidar) if any(map(needs_checkpoint, methods)) else None
     folder = report.output_folder(args.out) if args.out else None
     bar, advance = progress_bar(len(methods) * len(suite.episodes))
     with bar:

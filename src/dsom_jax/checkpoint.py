@@ -25,6 +25,13 @@ from dsom_jax.nn import DSOM, DSOMConfig, create, evaluation_view
 T = TypeVar("T")
 PROVENANCE = "provenance.json"
 FORMAT = 1
+SHIPPED = Path(__file__).parents[2] / "checkpoints" / "dsom"
+"""The network in the repository that this package runs from; not there once it is installed elsewhere."""
+
+
+def shipped() -> Path | None:
+    """The folder of the network that comes with the repository, if there is one."""
+    return SHIPPED if (SHIPPED / PROVENANCE).is_file() else None
 
 
 def save(directory: str | Path, model: DSOM, provenance: dict[str, Any] | None = None, tag: str = "weights") -> None:
