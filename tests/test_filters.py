@@ -1,5 +1,7 @@
 """Filters by what they do: equivalences, guards, inheritance, Algorithm 1, convergence."""
 
+# ruff: noqa: F811
+
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
@@ -12,65 +14,31 @@ import pytest
 
 import tiny_world
 from dsom_jax import montecarlo
-from dsom_jax import pose_grid as pg
 from dsom_jax.episode import Episode
 from dsom_jax.filters.adam import AdamMCL
-from dsom_jax.filters.adam_robust import AdamRobust, RobustConfig
 from dsom_jax.filters.common import ParticleState, heaviest_cluster
 from dsom_jax.filters.mcl import MCL
 from dsom_jax.filters.mixture import MixtureMCL
-from dsom_jax.filters.updates import FilterConfig, World
+from dsom_jax.filters.updates import FilterConfig
 from dsom_jax.motion import OdometryMotion
-from dsom_jax.proposals.likelihood_grid import LikelihoodGridConfig, likelihood_grid
-from dsom_jax.proposals.uniform import free_space
-from dsom_jax.raycast import RaycastConfig, make_tables
-from dsom_jax.sensor import BeamModel, ScoreModel
-from dsom_jax.types import Inputs
+from dsom_jax.proposals.likelihood_grid import likelihood_grid
+from filters_kit import (  # noqa: F401, fixtures
+    GRID,
+    LIDAR,
+    MCL_ONLY,
+    STILL,
+    at,
+    episode,
+    follow,
+    grid,
+    in_spot,
+    robust,
+    spot,
+    step,
+    tiny_trust,
+    world,
+)
 from reference import alg1, se2
-
-LIDAR = tiny_world.LIDAR
-STILL = OdometryMotion(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-SCORE = ScoreModel(sigma=0.4, range_max=LIDAR.range_max)
-BEAM = BeamModel(sigma_hit=0.2, temper=0.5, range_max=LIDAR.range_max)
-GRID = LikelihoodGridConfig(resolution=0.25, headings=16, angles_per_heading=2, beams=32, model=BEAM)
-MCL_ONLY = FilterConfig(64)
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Spot:
-    """A proposal that always points at the same cell, whatever the scan."""
-
-    pm: pg.ProbabilityMap
-
-    def prepare(self, inputs):
-        return self.pm
-
-    def sample(self, key, prepared, n):
-        return pg.sample(key, prepared, n)
-
-
-@pytest.fixture(scope="module")
-def grid():
-    return tiny_world.grid()
-
-
-@pytest.fixture(scope="module")
-def world(grid):
-    tables = make_tables(grid, RaycastConfig("table", angles=72), LIDAR.range_max)
-    return World(tables, free_space(grid), LIDAR, 1, OdometryMotion(), SCORE)
-
-
-@pytest.fixture(scope="module")
-def spot(grid):
-    mass = np.zeros((20, 24, 8), np.float32)
-    mass[16, 2, 3] = 1.0  # a corner where the robot is not
-    return Spot(pg.probability_map(pg.over(grid, 8), jnp.asarray(mass)))
-
-
-@pytest.fixture(scope="module")
-def episode():
-    return tiny_world.drive()
 
 
 @pytest.fixture(scope="module")
@@ -78,45 +46,8 @@ def scan_grid(grid):
     return likelihood_grid(grid, LIDAR, GRID)
 
 
-compiled_init = jax.jit(lambda f, key: f.init(key))
-compiled_step = jax.jit(lambda f, key, state, inputs: f.step(key, state, inputs, f.prepare(inputs)))
-
-
-def init(f, key):
-    """The filter's own start; all Score-weighted filters share one, and one compilation."""
-    return compiled_init(MCL(f.world, f.config, injection=0.0) if hasattr(f, "world") else f, key)
-
-
-def step(f, key, state, inputs):
-    """One update; numpy arrays have no weak types, which would cost another compilation."""
-    return compiled_step(f, key, *jax.tree.map(np.asarray, (state, inputs)))
-
-
-def at(episode, t):
-    return jax.tree.map(lambda leaf: leaf[t], episode.inputs)
-
-
-def follow(f, episode, steps, seed=0):
-    """States and diagnostics after each of the first updates."""
-    keys = jax.random.split(jax.random.key(seed), steps + 1)
-    state, passed = init(f, keys[0]), []
-    for t in range(steps):
-        state, info = step(f, keys[t + 1], state, at(episode, t))
-        passed.append((state, info))
-    return passed
-
-
-def in_spot(spot, poses):
-    return np.isfinite(np.asarray(pg.log_density(spot.pm, poses)))
-
-
 def identical(a, b):
     jax.tree.map(np.testing.assert_array_equal, a, b)
-
-
-def robust(world, proposal, particles=200, **fields):
-    config = RobustConfig(particles=particles, model=BEAM, **fields)
-    return AdamRobust(world.tables, world.space, proposal, LIDAR, 1, OdometryMotion(), config)
 
 
 def test_adam_that_trusts_everyone_is_mcl_is_mixture_that_never_redraws(world, spot, episode):
@@ -165,22 +96,6 @@ def test_trust_decides_who_is_redrawn(world, spot, episode):
     sets = [step(f, key, state, at(episode, 1))[0].poses for key in jax.random.split(jax.random.key(0), 60)]
     kept = [1 - in_spot(spot, poses).reshape(4, -1).mean(1) for poses in sets]
     np.testing.assert_allclose(np.mean(kept, 0), [1.0, 0.5, 0.1, 0.0], atol=5 * 0.5 / np.sqrt(60 * 16))
-
-
-def tiny_trust(grid, n, seed=0):
-    """Particles that are all redrawn, each with a weight of its own."""
-    poses, _ = free_space(grid).sample(jax.random.key(seed), None, n)
-    weights = 1e-12 * (1.0 + jnp.arange(n))
-    return ParticleState(poses, weights, weights / weights.sum(), jnp.int32(3))
-
-
-def test_nobody_to_be_trusted(world, spot, episode, grid):
-    f = AdamMCL(world, spot, MCL_ONLY, t_cut=0.6)
-    before = tiny_trust(grid, 64)
-    after, info = step(f, jax.random.key(0), before, at(episode, 1))
-    assert float(info.redrawn) == 1 and not bool(info.restarted) and in_spot(spot, after.poses).mean() > 0.95
-    assert np.isin(np.asarray(after.weights), np.asarray(before.weights)).all()
-    assert float(after.normalised.sum()) == pytest.approx(1.0, rel=1e-5)
 
 
 @pytest.mark.parametrize("rule", ["knn", "motion"])
@@ -244,93 +159,6 @@ def test_algorithm_1_line_by_line(world, episode, grid):
     theirs = np.array([[h / n, w.mean(), *p[:, :2].mean(0), w.std()] for p, w, h in slow]).T
     error = np.sqrt(ours.var(1) / runs + theirs.var(1) / runs)
     assert (np.abs(ours.mean(1) - theirs.mean(1)) < 4.5 * error).all(), (ours.mean(1), theirs.mean(1), error)
-
-
-def impossible(world):
-    """A world whose weights vanish for every scan but the exact one."""
-    return replace(world, score=ScoreModel(sigma=0.005, beta=0.0, range_max=LIDAR.range_max))
-
-
-def nonsense(episode):
-    return Inputs(jnp.full(LIDAR.beams, 1e4), episode.odometry[1], jnp.int32(1))
-
-
-def test_vanished_weights_restart_from_the_proposal_and_say_so(world, spot, episode):
-    f = AdamMCL(impossible(world), spot, MCL_ONLY)
-    state, info = step(f, jax.random.key(0), init(f, jax.random.key(1)), nonsense(episode))
-    assert bool(info.restarted) and in_spot(spot, state.poses).mean() > 0.95
-    np.testing.assert_allclose(state.normalised, 1 / 64, rtol=1e-6)
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((state, info)))
-
-
-@pytest.mark.xfail(reason="restarted particles have no trust, are all redrawn, and inherit zero weights for ever")
-def test_a_restart_is_over_when_scans_make_sense_again(world, spot, episode):
-    f = AdamMCL(impossible(world), spot, MCL_ONLY)
-    state, info = step(f, jax.random.key(0), init(f, jax.random.key(1)), nonsense(episode))
-    assert bool(info.restarted)
-    f = replace(f, world=world)
-    for t in (1, 2):
-        state, info = step(f, jax.random.key(t), state, at(episode, t))
-    assert not bool(info.restarted) and float(state.weights.sum()) > 0
-
-
-def everyone(world, proposal, n):
-    config = FilterConfig(n)
-    return {
-        "mcl": MCL(world, config),
-        "mixture": MixtureMCL(world, proposal, config, p=0.5),
-        "adam": AdamMCL(world, proposal, config),
-        "adam_robust": robust(world, proposal, n),
-    }
-
-
-FILTERS = ["mcl", "mixture", "adam", "adam_robust"]
-
-
-def assert_sound(state, info, n):
-    assert state.poses.shape == (n, 3)
-    for leaf in jax.tree.leaves((state.poses, info)):
-        assert np.isfinite(np.asarray(leaf, float)).all()
-    assert 0 <= float(info.lost) <= 1 and 0 <= float(info.redrawn) <= 1
-    weights = state.normalised if hasattr(state, "normalised") else jnp.exp(state.log_weights)
-    assert float(weights.sum()) == pytest.approx(1.0, rel=1e-4)
-
-
-@pytest.mark.parametrize("name", FILTERS)
-def test_scans_without_evidence_break_nothing(name, world, spot, episode):
-    f = everyone(world, spot, 64)[name]
-    state = init(f, jax.random.key(0))
-    for t, reading in enumerate([np.nan, -np.inf, np.inf, 0.0, 1e6, np.nan]):
-        blind = Inputs(jnp.full(LIDAR.beams, reading), episode.odometry[1], jnp.int32(t))
-        state, info = step(f, jax.random.key(t), state, blind)
-        assert_sound(state, info, 64)
-    state, info = step(f, jax.random.key(9), state, at(episode, 1))
-    assert_sound(state, info, 64)
-
-
-@pytest.mark.parametrize(("name", "n"), [("mcl", 2), ("mixture", 1), ("adam", 2), ("adam_robust", 1)])
-def test_hardly_any_particles_and_no_key_is_used_twice(name, n, world, episode):
-    f = everyone(world, world.space, n)[name]
-    with jax.debug_key_reuse(True):
-        for state, info in follow(f, episode, 4):
-            assert_sound(state, info, n)
-
-
-@pytest.mark.xfail(reason="a weak type in the first state costs a loop over steps a second compilation")
-@pytest.mark.parametrize("name", FILTERS)
-def test_an_update_keeps_the_types_of_the_state(name, world, spot, episode):
-    f = everyone(world, spot, 8)[name]
-    before = jax.eval_shape(f.init, jax.random.key(0))
-    now = at(episode, 0)
-    after, _ = jax.eval_shape(lambda key, state: f.step(key, state, now, spot.pm), jax.random.key(0), before)
-    kinds = [[(v.shape, v.dtype, v.weak_type) for v in jax.tree.leaves(state)] for state in (before, after)]
-    assert kinds[0] == kinds[1]
-
-
-def test_no_particles_are_refused():
-    for config in (FilterConfig, RobustConfig):
-        with pytest.raises(ValueError, match="at least one"):
-            config(particles=0)
 
 
 def final_errors(f, episode, runs=8):
