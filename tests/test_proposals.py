@@ -197,7 +197,6 @@ def test_star_knows_the_sequence_but_not_the_current_pose(features, episode):
     assert later.mass[i, j, k % 16] / later.mass.sum() > as_it_is[i, j, k % 16] / as_it_is.sum() + 1e-4
 
 
-@pytest.mark.xfail(reason="flat_cells takes NaN for cell (0, 0, 0)")
 def test_unknown_poses_of_a_sequence_are_no_samples(features, episode):
     unknown = episode._replace(poses=jnp.full_like(episode.poses, jnp.nan))
     star = with_episode(features, unknown)

@@ -267,7 +267,7 @@ def main() -> None:
     checkpoint = args.checkpoint or networks.shipped()
     methods = chosen_methods(args.methods, checkpoint)
     suite = load_suite(args.suite)
-    network = networks.load(checkpoint, suite.lidar) if any(map(needs_checkpoint, methods)) else None
+    network = networks.load(checkpoint, suite.lidar) if checkpoint and any(map(needs_checkpoint, methods)) else None
     folder = report.output_folder(args.out) if args.out else None
     bar, advance = progress_bar(len(methods) * len(suite.episodes))
     with bar:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from rich.progress import Progress
 
@@ -125,7 +126,7 @@ def limited(log: RawLog, range_max: float) -> RawLog:
     if range_max <= log.lidar.range_min:
         raise UserError(f"--laser-max-range {range_max}: must exceed the lidar's range_min, {log.lidar.range_min} m")
     lidar = replace(log.lidar, range_max=min(log.lidar.range_max, range_max))
-    ranges = np.asarray(apply_limits(log.ranges, lidar))
+    ranges = np.asarray(apply_limits(jnp.asarray(log.ranges), lidar))
     if not np.isfinite(ranges).any():
         raise UserError(f"--laser-max-range {range_max}: no reading of {log.path} is shorter; give a greater one")
     return replace(log, lidar=lidar, ranges=ranges)

@@ -22,7 +22,7 @@ class Inputs(NamedTuple):
 
     ranges: Array
     odometry: Array
-    index: Array
+    index: Array  # type: ignore[assignment]  # hides tuple.index, which nobody needs here
 
 
 class Motion(Protocol):

@@ -11,6 +11,7 @@ redrawn place takes over only when the evidence outweighs eps. The start is the 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -111,7 +112,7 @@ class AdamRobust:
         """Uniform particles; the first update replaces them all."""
         n = self.config.particles
         poses, _ = self.space.sample(key, None, n)
-        return RobustState(poses, jnp.full((n,), -jnp.log(n)), jnp.float32(1.0), jnp.int32(0))
+        return RobustState(poses, jnp.full((n,), -math.log(n), jnp.float32), jnp.float32(1.0), jnp.int32(0))
 
     def step(self, key: Key, state: RobustState, inputs: Inputs, prepared: Any) -> tuple[RobustState, Info]:
         """One update."""

@@ -122,7 +122,9 @@ def make_proposal(
     if name == "dsom":
         return dsom(checkpoint, grid, lidar)
     collected = dual_features(jax.random.key(settings.seed), grid, lidar, DualFeaturesConfig())
-    return collected if name == "dual_features" else with_episode(collected, episode)
+    if name == "dual_features" or episode is None:
+        return collected
+    return with_episode(collected, episode)
 
 
 def make_filter(

@@ -78,7 +78,7 @@ class Draw(NamedTuple):
 def start(key: Key, world: World, config: FilterConfig) -> ParticleState:
     """Uniform particles over free space: no prior."""
     poses, _ = world.space.sample(key, None, config.particles)
-    even = jnp.full((config.particles,), 1.0 / config.particles)
+    even = jnp.full((config.particles,), 1.0 / config.particles, jnp.float32)
     return ParticleState(poses, jnp.zeros(config.particles), even, jnp.int32(0))
 
 
@@ -155,12 +155,15 @@ def _nearest(poses: Array, others: Array, count: int) -> tuple[Array, Array]:
 
 
 def mix(state: ParticleState, high: Array, trusted: Draw, redrawn: Draw, spare: Array) -> tuple[ParticleState, Info]:
-    """P_t of the two branches; if every weight has vanished, the poses ``spare`` (N, 3) take over (flagged in Info)."""
+    """P_t of the two branches; if every weight has vanished, the poses ``spare`` (N, 3) take over (flagged in Info).
+
+    They are trusted for one update, or none of them would ever be weighed.
+    """
     poses = jnp.where(high[:, None], trusted.poses, redrawn.poses)
     weights = jnp.where(high, trusted.weights, redrawn.weights)
     dead = ~(weights.sum() > 0)
     poses = jnp.where(dead, spare, poses)
-    weights = jnp.where(dead, 0.0, weights)
+    weights = jnp.where(dead, 1.0, weights)
     normalised = normalise(weights)
     return ParticleState(poses, weights, normalised, state.updates + 1), describe(
         poses, normalised, 1.0 - high.mean(), dead

@@ -121,7 +121,8 @@ def with_episode(proposal: DualFeatures, episode: Episode) -> DualFeatures:
 
 def flat_cells(pose_grid: pg.PoseGrid, poses: Array) -> Array:
     """(n,) int32 flat index of the cell of each map-frame pose (n, 3); beyond the last one where off the grid."""
-    i, j, k = (jnp.round(v).astype(jnp.int32) for v in pg.pose_cell(pose_grid, poses))
+    known = jnp.isfinite(poses).all(-1)
+    i, j, k = (jnp.where(known, jnp.round(v), -1).astype(jnp.int32) for v in pg.pose_cell(pose_grid, poses))
     on_grid = (i >= 0) & (i < pose_grid.height) & (j >= 0) & (j < pose_grid.width)
     flat = (i * pose_grid.width + j) * pose_grid.headings + k % pose_grid.headings
     return jnp.where(on_grid, flat, math.prod(pose_grid.shape))

@@ -88,7 +88,7 @@ class LikelihoodGrid:
 def likelihood_grid(grid: OccupancyGrid, lidar: LidarConfig, config: LikelihoodGridConfig) -> LikelihoodGrid:
     """Proposal for a map; casts C * A exact rays once."""
     coarse = resample_free(grid, config.resolution)
-    pose_grid = pg.PoseGrid(grid.origin, *coarse.shape, config.headings, coarse.resolution)
+    pose_grid = pg.over(coarse, config.headings)
     count = -(-int(coarse.free.sum()) // _BLOCK) * _BLOCK
     cells = jnp.flatnonzero(coarse.free, size=count, fill_value=coarse.free.size).astype(jnp.int32)
     tables = make_tables(grid, config.raycast, config.model.range_max)
