@@ -1,0 +1,251 @@
+"""Bad input of every kind ends each command with one line that names the file, the field and the fix, and exit code 2.
+
+The readers have tests of their own for every malformed field; here the commands are held against one of each kind:
+no traceback, and nothing written.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dsom_jax import bench, checkpoint, localize, train
+from dsom_jax.data import save_tum
+from dsom_jax.errors import UserError, run_cli
+from dsom_jax.nn import DSOMConfig, create
+from tiny_log import META, UPDATES, record, write_log
+
+PGM = b"P5\n4 4\n255\n"
+SHAPE = (UPDATES, 32)
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory):
+    """A good recording, and a good checkpoint for whole turns of at least 10 m."""
+    folder = tmp_path_factory.mktemp("good")
+    checkpoint.save(folder / "net", create(DSOMConfig(width=2, headings=4)))
+    return record(folder)
+
+
+@pytest.fixture
+def good(original, tmp_path):
+    """A copy that may be spoilt."""
+    for name in ("room.yaml", "room.pgm", "drive.log", "meta.yaml", "truth.tum"):
+        (tmp_path / name).write_bytes((original.map.parent / name).read_bytes())
+    (tmp_path / "net").symlink_to(original.map.parent / "net")
+    return original
+
+
+@pytest.fixture
+def refused(tmp_path, monkeypatch, capfd):
+    """Calls a command inside of ``tmp_path``, and returns its error line."""
+
+    def call(main: Callable[[], None], *words: str) -> str:
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(sys, "argv", ["command", *words])
+        before = snapshot(tmp_path)
+        capfd.readouterr()
+        with pytest.raises(SystemExit) as stop:
+            run_cli(main)
+        shown = capfd.readouterr()
+        assert stop.value.code == 2 and snapshot(tmp_path) == before
+        assert shown.err.startswith("error: ") and shown.err.count("\n") == 1 and "Traceback" not in shown.out
+        return shown.err
+
+    return call
+
+
+def snapshot(folder: Path) -> dict[Path, bytes | None]:
+    """Everything in a folder."""
+    return {path: path.read_bytes() if path.is_file() else None for path in sorted(folder.rglob("*"))}
+
+
+def replaced(path: Path, old: str, new: str) -> None:
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+
+
+def no_free_space(folder: Path) -> None:
+    (folder / "room.pgm").write_bytes(PGM + bytes(16))
+
+
+def gzip_cut_short(folder: Path) -> None:
+    (folder / "drive.log").write_bytes(b"\x1f\x8b\x08 broken")
+
+
+LOCALIZE = ("--map", "room.yaml", "--log", "drive.log", "--out", "out", "--runs", "2", "--particles", "10")
+FILES = {
+    "no map": (lambda d: (d / "room.yaml").unlink(), ["room.yaml", "no such map yaml"]),
+    "map is no yaml": (lambda d: (d / "room.yaml").write_text("a: [1"), ["room.yaml", "not valid YAML"]),
+    "map is a picture": (lambda d: (d / "room.yaml").write_bytes(PGM + bytes(range(240, 256))), ["room.yaml"]),
+    "no resolution": (lambda d: replaced(d / "room.yaml", "resolution", "scale"), ["room.yaml", "'resolution'"]),
+    "origin": (
+        lambda d: replaced(d / "room.yaml", "origin: [", "origin: [x, "),
+        ["room.yaml", "[x, y, yaw]"],
+    ),
+    "no image": (lambda d: (d / "room.pgm").unlink(), ["room.pgm", "'image'"]),
+    "cut image": (lambda d: (d / "room.pgm").write_bytes(PGM + b"abc"), ["room.pgm"]),
+    "no free space": (no_free_space, ["room.yaml", "no free cell", "negate"]),
+    "no log": (lambda d: (d / "drive.log").unlink(), ["drive.log", "no such log"]),
+    "log of words": (lambda d: (d / "drive.log").write_text("to be or\nnot to be\n"), ["drive.log", "FLASER"]),
+    "empty log": (lambda d: (d / "drive.log").write_text(""), ["drive.log", "FLASER"]),
+    "broken gzip": (gzip_cut_short, ["drive.log", "gzip"]),
+    "wrong lidar": (lambda d: replaced(d / "meta.yaml", "beams: 32", "beams: 31"), ["meta.yaml", "wrong lidar"]),
+    "degrees": (lambda d: replaced(d / "meta.yaml", "increment: 0.", "increment: 11."), ["drive.log", "radians"]),
+    "mount": (lambda d: (d / "meta.yaml").write_text(META + "mount: front\n"), ["meta.yaml", "mount", "[x, y, yaw]"]),
+    "all NaN": (lambda d: write_log(d, np.full(SHAPE, np.nan)), ["drive.log", "NaN"]),
+    "all zero": (lambda d: write_log(d, np.zeros(SHAPE)), ["drive.log", "zero"]),
+    "beyond the limit": (lambda d: write_log(d, np.full(SHAPE, 60.0)), ["drive.log", "5 m", "range_max"]),
+    "standing still": (lambda d: stand_still(d), ["drive.log", "1 updates", "--update-min-d"]),
+}
+
+
+def stand_still(folder: Path) -> None:
+    """The same scan again and again, under different stamps."""
+    first = (folder / "drive.log").read_text().splitlines()[0].split()
+    lines = [" ".join([*first[:-3], str(1000.0 + n), *first[-2:]]) for n in range(UPDATES)]
+    (folder / "drive.log").write_text("\n".join(lines) + "\n")
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_localize_with_spoilt_files(good, refused, tmp_path, kind):
+    spoil, fragments = FILES[kind]
+    spoil(tmp_path)
+    error = refused(localize.main, *LOCALIZE)
+    assert all(fragment in error for fragment in fragments), error
+
+
+@pytest.mark.parametrize(
+    ("words", "fragments"),
+    [
+        (("--particles", "0"), ["--particles 0", "positive"]),
+        (("--runs", "-1"), ["--runs -1"]),
+        (("--segments", "0"), ["--segments 0"]),
+        (("--max-beams", "0"), ["--max-beams 0"]),
+        (("--seed", "-1"), ["--seed -1"]),
+        (("--t-cut", "1"), ["--t-cut 1.0", "0.6"]),
+        (("--steps-per-segment", "3"), ["--steps-per-segment 3", "at least 6"]),
+        (("--steps-per-segment", "0", "--segments", "8"), ["drive.log", "5 updates", "fewer --segments"]),
+        (("--update-min-d", "-1"), ["--update-min-d -1.0"]),
+        (("--update-min-a", "nan"), ["--update-min-a nan"]),
+        (("--laser-max-range", "nan"), ["--laser-max-range nan"]),
+        (("--laser-max-range", "0.01"), ["--laser-max-range 0.01", "drive.log"]),
+        (("--kidnap", "--segments", "1"), ["--segments 1", "--kidnap"]),
+        (("--reference", "nowhere.tum"), ["nowhere.tum", "no such trajectory"]),
+        (("--reference", "room.yaml"), ["room.yaml", "line 1", "stamp x y z"]),
+        (("--reference", "early.tum"), ["early.tum", "same clock"]),
+        (("--log", "drive.txt"), ["drive.txt", "'.txt'", "CARMEN"]),
+        (("--log", "drive.bag"), ["drive.bag"]),
+        (("--proposal", "dsom"), ["--checkpoint"]),
+        (("--proposal", "dsom", "--checkpoint", "nowhere"), ["nowhere/provenance.json", "dsom_jax.train"]),
+        (("--proposal", "dsom", "--checkpoint", "broken"), ["broken/provenance.json", "not JSON"]),
+        (("--proposal", "dsom", "--checkpoint", "empty"), ["empty/provenance.json", "format"]),
+        (("--proposal", "dsom", "--checkpoint", "net"), ["net", "does not fit the lidar", "range_max 5 m"]),
+        (("--out", "room.yaml"), ["--out room.yaml", "cannot write"]),
+        (("--out", "room.yaml/deeper"), ["--out room.yaml/deeper", "cannot write"]),
+    ],
+    ids=lambda part: " ".join(part) if isinstance(part, tuple) else "",
+)
+def test_localize_with_wrong_words(good, refused, tmp_path, words, fragments):
+    save_tum(tmp_path / "early.tum", np.arange(3.0), np.zeros((3, 3)))
+    (tmp_path / "drive.txt").write_text("")
+    (tmp_path / "drive.bag").write_bytes(b"#ROSBAG V2.0\nnot really")
+    for name, text in (("broken", "{"), ("empty", "{}")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "provenance.json").write_text(text)
+    error = refused(localize.main, *LOCALIZE, *words)
+    assert all(fragment in error for fragment in fragments), error
+
+
+def test_a_checkpoint_whose_weights_are_of_another_configuration(good, refused, tmp_path):
+    for name, width in (("small", 2), ("big", 3)):
+        checkpoint.save(tmp_path / name, create(DSOMConfig(width=width, headings=4, reach_min=1.0)))
+    record_path = tmp_path / "small" / "provenance.json"
+    described = json.loads(record_path.read_text())
+    record_path.write_text(json.dumps({**described, "model": {**described["model"], "width": 3}}))
+    error = refused(localize.main, *LOCALIZE, "--proposal", "dsom", "--checkpoint", "small")
+    assert "small/weights" in error and "another configuration" in error
+
+
+@pytest.mark.parametrize(
+    ("text", "fragments"),
+    [
+        (None, ["suite.toml", "no such suite file"]),
+        ("a = [", ["suite.toml", "not valid TOML"]),
+        ("name = 'x'", ["suite.toml", "[[episodes]]"]),
+        ("[[episodes]]\nmap = 'nowhere.yaml'", ["nowhere.yaml", "no such map yaml"]),
+        ("[[episodes]]\nmap = 'room.yaml'\nspeed = 3", ["suite.toml", "episodes[0]", "'speed'"]),
+        ("[lidar]\nbeams = 0\n[[episodes]]\nmap = 'room.yaml'", ["suite.toml", "lidar", "beams"]),
+    ],
+)
+def test_bench_with_spoilt_suites(good, refused, tmp_path, text, fragments):
+    if text is not None:
+        (tmp_path / "suite.toml").write_text(text)
+    error = refused(bench.main, "--suite", "suite.toml", "--out", "out")
+    assert all(fragment in error for fragment in fragments), error
+
+
+@pytest.mark.parametrize(("folder", "fragment"), [("nowhere", "no such file"), ("far", "range_max 10 m")])
+def test_bench_with_a_checkpoint_that_does_not_fit(refused, tmp_path, folder, fragment):
+    checkpoint.save(tmp_path / "far", create(DSOMConfig(width=2, headings=4, reach_min=12.0)))
+    error = refused(bench.main, "--methods", "adam_dsom", "--checkpoint", folder, "--out", "out")
+    assert folder in error and fragment in error
+
+
+COMMANDS = [name for name in ("localize", "bench", "train", "evaluate") if importlib.util.find_spec(f"dsom_jax.{name}")]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_words_that_no_command_knows(refused, command):
+    main = importlib.import_module(f"dsom_jax.{command}").main
+    error = refused(main, "--colour", "blue")
+    assert f"python -m dsom_jax.{command} --help" in error and ("--colour" in error or "Missing" in error)
+
+
+@pytest.mark.parametrize(
+    ("words", "fragments"),
+    [
+        ((), ["--map", "--log", "--out", "Missing"]),
+        ((*LOCALIZE, "--runs", "abc"), ["--runs", "abc"]),
+        ((*LOCALIZE, "--runs"), ["--runs"]),
+        ((*LOCALIZE, "--method", "magic"), ["--method", "'magic'", "adam_robust"]),
+        ((*LOCALIZE, "--particels", "5"), ["--particels", "Perhaps you meant", "--particles INT"]),
+        ((*LOCALIZE, "extra"), ["Unrecognized options: extra"]),
+    ],
+)
+def test_words_that_cannot_be_read(refused, words, fragments):
+    error = refused(localize.main, *words)
+    assert all(fragment in error for fragment in fragments), error
+
+
+@pytest.mark.parametrize("main", [bench.main, train.main, localize.main])
+def test_help_is_no_error(main, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["command", "--help"])
+    with pytest.raises(SystemExit) as stop:
+        run_cli(main)
+    assert not stop.value.code and "--out" in capsys.readouterr().out
+
+
+def test_errors_of_several_lines_become_one(capsys):
+    def main() -> None:
+        raise UserError("a.yaml: first\n   second")
+
+    with pytest.raises(SystemExit) as stop:
+        run_cli(main)
+    assert stop.value.code == 2 and capsys.readouterr().err == "error: a.yaml: first second\n"
+
+
+def test_as_a_module(good, tmp_path):
+    (tmp_path / "room.pgm").unlink()
+    command = [sys.executable, "-m", "dsom_jax.localize", *LOCALIZE]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 2 and done.stdout == "" and not (tmp_path / "out").exists()
+    assert done.stderr.startswith("error: room.pgm: ") and done.stderr.count("\n") == 1

@@ -1,0 +1,117 @@
+"""``python -m dsom_jax.localize`` on a made-up room: what it writes, with and without reference and kidnapping."""
+
+from __future__ import annotations
+
+import json
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+from evo.tools import file_interface
+
+from dsom_jax import localize
+from dsom_jax.errors import run_cli
+from tiny_log import START, UPDATES, record
+
+KEYS = {
+    "map": str, "log": str, "method": str, "proposal": str, "particles": int, "segments": int, "runs": int,
+    "updates": int, "converged": float, "converged_ci95": list, "steps_median": float, "metres_median": float,
+    "e_pos_m_median": float, "e_theta_rad_median": float, "retention": float, "strict_success": float,
+    "false_confident": float, "ms_per_update": float,
+}  # fmt: skip
+"""``summary.json`` of DESIGN section 5."""
+RATES = ("converged", "retention", "strict_success", "false_confident")
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    return record(tmp_path_factory.mktemp("room"))
+
+
+@pytest.fixture
+def call(room, tmp_path, monkeypatch, capsys):
+    """Runs the command; gives summary.json and what was printed."""
+
+    def go(*words: str, reference: bool = True, out: str = "out") -> tuple[dict[str, Any], str]:
+        known = ["--reference", str(room.reference)] if reference else []
+        common = ["--map", room.map, "--log", room.log, "--out", tmp_path / out, *known, "--runs", 4]
+        common += ["--particles", 60, "--segments", 2, "--steps-per-segment", 20, *words]
+        monkeypatch.setattr(sys, "argv", ["localize", *map(str, common)])
+        run_cli(localize.main)
+        text = (tmp_path / out / "summary.json").read_text()
+        return json.loads(text, parse_constant=pytest.fail), capsys.readouterr().out
+
+    return go
+
+
+def test_with_reference(call, room, tmp_path):
+    summary, printed = call()
+    wrong = {key: summary.get(key) for key, kind in KEYS.items() if not isinstance(summary.get(key), kind)}
+    assert not wrong
+    assert (summary["map"], summary["log"]) == (str(room.map), str(room.log))
+    assert (summary["method"], summary["proposal"]) == ("adam_robust", "likelihood_grid")
+    counts = [summary[key] for key in ("particles", "segments", "runs", "updates")]
+    assert counts == [60, 2, 4, 40] and summary["ms_per_update"] > 0
+    assert all(0 <= summary[rate] <= 1 for rate in RATES)
+    # 32 exact beams all round of a room without symmetry: whoever misses this one is broken.
+    assert summary["converged"] == 1 and summary["strict_success"] == 1 and summary["e_pos_m_median"] < 0.1
+    low, high = summary["converged_ci95"]
+    assert low < 1 and high == 1
+    assert [segment["on_map"] for segment in summary["by_segment"]] == [1, 1]
+    assert "converged 100.0%" in printed and {p.name for p in (tmp_path / "out").iterdir()} == {
+        "summary.json", "estimate.tum",
+    }  # fmt: skip
+    trajectory = file_interface.read_tum_trajectory_file(tmp_path / "out" / "estimate.tum")
+    truth = file_interface.read_tum_trajectory_file(room.reference)
+    valid, details = trajectory.check()
+    assert valid, details
+    # Segments of 20, one at each end of the log.
+    expected = [*range(20), *range(UPDATES - 20, UPDATES)]
+    np.testing.assert_allclose(trajectory.timestamps, START + np.array(expected), atol=1e-6)
+    off = np.linalg.norm(trajectory.positions_xyz - truth.positions_xyz[expected], axis=-1)
+    # Only the first answers, after a scan or two, may be wrong.
+    assert np.median(off) < 0.1 and (off.reshape(2, 20)[:, 5:] < 0.5).all()
+
+
+def test_same_seed_same_summary_and_estimate(call, tmp_path):
+    (first, _), (again, _), (other, _) = call(), call(out="again"), call("--seed", "1", out="other")
+    assert first.pop("ms_per_update") > 0 and again.pop("ms_per_update") > 0
+    assert first == again
+    files = [(tmp_path / out / "estimate.tum").read_bytes() for out in ("out", "again", "other")]
+    assert files[0] == files[1] != files[2]
+    assert other["e_pos_m_median"] != first["e_pos_m_median"]
+
+
+def test_without_reference(call, tmp_path):
+    summary, printed = call(reference=False)
+    assert summary["reference"] is None and not set(RATES) & set(summary)
+    assert summary["updates"] == 40 and 0 <= summary["confident"] <= 1 and "no reference" in printed
+    assert len(file_interface.read_tum_trajectory_file(tmp_path / "out" / "estimate.tum").timestamps) == 40
+
+
+def test_reference_of_one_segment_only(call, room, tmp_path, recwarn):
+    rows = room.reference.read_text().splitlines(keepends=True)
+    (tmp_path / "part.tum").write_text("".join(rows[:20]))
+    summary, _ = call("--reference", str(tmp_path / "part.tum"), reference=False)
+    known, unknown = summary["by_segment"]
+    assert summary["experiments"] == 4 and summary["converged"] == 1 and known["converged"] == 1
+    assert unknown["on_map"] is unknown["converged"] is unknown["e_pos_m_median"] is None
+    assert not [w for w in recwarn if issubclass(w.category, RuntimeWarning)]
+
+
+def test_kidnapping(call, tmp_path):
+    summary, printed = call("--kidnap", "--steps-per-segment", "10")
+    assert not {key for key, kind in KEYS.items() if not isinstance(summary.get(key), kind)}
+    assert summary["updates"] == 40 and summary["experiments"] == summary["kidnap"]["experiments"] == 8
+    phases = [key for key, kind in KEYS.items() if key in summary["kidnap"] and kind in (float, list)]
+    assert set(RATES) | {"steps_median", "metres_median"} <= set(phases)
+    assert summary["kidnap"]["converged"] == 1 and "kidnapping: converged" in printed
+    # Both halves of the log are driven twice, the estimate tells each moment once.
+    stamps = file_interface.read_tum_trajectory_file(tmp_path / "out" / "estimate.tum").timestamps
+    assert len(stamps) == 20 and (np.diff(stamps) > 0).all()
+
+
+def test_the_filter_of_the_paper(call):
+    summary, _ = call("--method", "adam", "--t-cut", "0.7")
+    assert summary["method"] == "adam" and summary["experiments"] == 8
