@@ -32,15 +32,20 @@ Parts = dict[str, tuple[Callable[..., Any], tuple[Any, ...]]]
 """Name -> (function of one run, its arguments, of which the leading axis is the run)."""
 
 
-def main(runs: int = 100, particles: int = 200, repeats: int = 15, warm: int = 8) -> None:
+def main(runs: int = 100, particles: int = 200, repeats: int = 15, warm: int = 8, only: tuple[str, ...] = ()) -> None:
     """Measure, print and save."""
     suite = load_suite("synthetic-v1")
     _, grid, episode = suite.episodes[0]
     measured = {}
     for name, method in METHODS.items():
+        if only and name not in only:
+            continue
         filter = build_filter(method, grid, suite.lidar, particles=particles, t_cut=0.6)
         measured[name] = method_times(filter, episode, runs, repeats, warm)
-        print(f"{name}: " + ", ".join(f"{k} {v['wall_ms']:.1f} ({v['cpu_ms']:.1f})" for k, v in measured[name].items()))
+        print(
+            f"{name}: " + ", ".join(f"{k} {v['wall_ms']:.1f} ({v['cpu_ms']:.1f})" for k, v in measured[name].items()),
+            flush=True,
+        )
     print("milliseconds of all runs together: median wall clock (processor time / cores)")
     load = {"runs": runs, "particles": particles, "beams": 72, "map": list(grid.shape), "repeats": repeats}
     save("step", {"machine": machine(), "load": load, "methods": measured})
