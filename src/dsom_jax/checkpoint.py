@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import warnings
 from dataclasses import asdict, fields
 from importlib.metadata import version
 from pathlib import Path
@@ -131,7 +132,9 @@ def _load_tree(path: Path, like: T) -> T:
         raise UserError(f"{path}: the folder of the weights is missing; copy the whole checkpoint or train again")
     abstract = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), like)
     try:
-        tree = ocp.load(path, abstract)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message="Sharding info not provided")  # one device or many: as it comes
+            tree = ocp.load(path, abstract)
     except Exception as error:  # orbax and tensorstore raise many kinds; all mean that the files do not fit
         reason = f"weights are damaged or of another configuration ({_first_line(error)})"
         raise UserError(f"{path}: {reason}; train again") from error

@@ -121,6 +121,8 @@ def make_proposal(
         return likelihood_grid(grid, lidar, replace(settings.grid, model=model))
     if name == "dsom":
         return dsom(checkpoint, grid, lidar)
+    if name not in ("dual_features", "dual_features_star"):
+        raise ValueError(f"make_proposal: no proposal is called {name!r}")
     collected = dual_features(jax.random.key(settings.seed), grid, lidar, DualFeaturesConfig())
     if name == "dual_features" or episode is None:
         return collected

@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 
 from dsom_jax.filters.common import Info, ParticleState, describe, normalise
-from dsom_jax.geometry import wrap_angle
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.proposals.uniform import FreeSpace
 from dsom_jax.raycast import MapTables, cast_rays
@@ -143,7 +142,8 @@ def _nearest(poses: Array, others: Array, count: int) -> tuple[Array, Array]:
     The index replaces the lowest bits of the distance, so that each neighbour is one vectorised minimum.
     """
     gap = poses[:, None] - others
-    squared = gap[..., 0] ** 2 + gap[..., 1] ** 2 + wrap_angle(gap[..., 2]) ** 2
+    turn = jnp.abs(gap[..., 2])  # below 2 pi, as headings lie in [-pi, pi)
+    squared = gap[..., 0] ** 2 + gap[..., 1] ** 2 + jnp.minimum(turn, 2 * jnp.pi - turn) ** 2
     bits = max(1, (others.shape[0] - 1).bit_length())
     low = (1 << bits) - 1
     keys = (jax.lax.bitcast_convert_type(squared, jnp.int32) & ~low) | jnp.arange(others.shape[0], dtype=jnp.int32)
@@ -181,8 +181,7 @@ def mixture_update(
     config: FilterConfig,
 ) -> tuple[ParticleState, Info]:
     """MCL update of the particles ``high`` (N,), dual MCL update of the others (Alg 1, lines 10 to 21)."""
-    k_high, k_low, k_spare = jax.random.split(key, 3)
+    k_high, k_low, _ = jax.random.split(key, 3)
     trusted = mcl_update(k_high, state, high, inputs, world, config)
     redrawn = dual_update(k_low, state, inputs, world, proposal, prepared, config)
-    spare, _ = proposal.sample(k_spare, prepared, config.particles)
-    return mix(state, high, trusted, redrawn, spare)
+    return mix(state, high, trusted, redrawn, redrawn.poses)
