@@ -157,3 +157,20 @@ def test_bad_parameters_are_refused():
     with pytest.raises(ValueError, match="cannot be negative"):
         OdometryMotion(alpha3=-0.1)
     assert hash(OdometryMotion()) == hash(OdometryMotion())
+
+
+def test_slips_drive_any_share_of_the_way():
+    model = OdometryMotion(**QUIET, slip=0.3)
+    x = np.asarray(sample(model, jax.random.key(0), jnp.zeros((N, 3)), jnp.array([0.5, 0.0, 0.0])))[:, 0]
+    slipped = np.abs(x - 0.5) > 1e-5
+    assert slipped.mean() == pytest.approx(0.3, abs=5 * 0.5 / math.sqrt(N))
+    assert stats.kstest(x[slipped], "uniform", (-0.6, 1.2)).statistic < 2 / math.sqrt(0.3 * N)
+
+
+def test_the_tail_is_wider_noise_for_some():
+    plain, heavy = (
+        np.asarray(sample(OdometryMotion(**SMALL, **tail), jax.random.key(1), jnp.zeros((N, 3)), jnp.zeros(3)))
+        for tail in ({}, {"tail": 0.25, "tail_scale": 4.0})
+    )
+    # A mixture's variance is the mean of the variances; a sample variance of such tails deviates by about 1 %.
+    np.testing.assert_allclose(heavy.var(0) / plain.var(0), 0.75 + 0.25 * 16, rtol=0.06)

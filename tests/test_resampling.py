@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dsom_jax import resampling
-from dsom_jax.resampling import pick
+from dsom_jax.resampling import pick, pick_in_rows
 
 SCHEMES = ["systematic", "multinomial"]
 resample = jax.jit(resampling.resample, static_argnums=(2, 3))
@@ -91,3 +91,16 @@ def test_a_key_is_a_draw():
     first, again, other = (resample(jax.random.key(k), weights, 50, "multinomial") for k in (0, 0, 1))
     np.testing.assert_array_equal(first, again)
     assert (first != other).any()
+
+
+@given(st.integers(0, 10_000), st.integers(1, 70))
+def test_picking_in_rows_is_picking_in_each_row(seed, width):
+    rng = np.random.default_rng(seed)
+    weights = rng.exponential(size=(6, width)).astype(np.float32) * (rng.random((6, width)) < 0.5)
+    weights[:, rng.integers(width)] = 1.0
+    cumulative = jnp.cumsum(jnp.asarray(weights), -1)
+    rows, positions = rng.integers(0, 6, 40), jnp.asarray(rng.random(40), jnp.float32)
+    found = pick_in_rows(cumulative, jnp.asarray(rows, jnp.int32), positions)
+    alone = [int(pick(cumulative[row], position)) for row, position in zip(rows, positions, strict=True)]
+    assert found.tolist() == alone
+    assert (weights[rows, np.asarray(found)] > 0).all()

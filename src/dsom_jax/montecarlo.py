@@ -56,7 +56,8 @@ def run(filter: Filter, episode: Episode, keys: Key, keep: Sequence[int] = ()) -
     chosen = jnp.asarray(keep, jnp.int32) if len(keep) else None
     shared = jax.device_put((filter, episode.inputs, chosen), NamedSharding(mesh, P()))
     info, state, kept = _runner(mesh)(*shared, keys)
-    info, state = jax.tree.map(lambda leaf: leaf[:runs], (info, state))
+    if filled > runs:
+        info, state = jax.tree.map(lambda leaf: leaf[:runs], (info, state))
     return Result(info, state, jax.tree.map(lambda leaf: leaf[0], kept))
 
 

@@ -65,15 +65,19 @@ class OdometryMotion:
     def sample(self, key: Key, poses: Array, odometry: Array) -> Array:
         """One successor of each pose (..., 3)."""
         parts, sigma = self.spread(odometry)
-        k_parts, k_floor, k_slip, k_tail = jax.random.split(key, 4)
-        wide = jax.random.uniform(k_tail, (*poses.shape[:-1], 1)) < self.tail
-        scale = jnp.where(wide, self.tail_scale, 1.0)
-        noise = scale * jax.random.normal(k_parts, (*poses.shape[:-1], 3))
-        first, travel, second = jnp.moveaxis(parts + sigma * noise, -1, 0)
+        k_noise, k_slip, k_tail = jax.random.split(key, 3)
+        scale = self._scale(k_tail, (*poses.shape[:-1], 1))
+        noise = scale * jax.random.normal(k_noise, (*poses.shape[:-1], 5))
+        first, travel, second = jnp.moveaxis(parts + sigma * noise[..., :3], -1, 0)
         travel = travel * self._share_driven(k_slip, travel.shape)
         step = jnp.stack([travel * jnp.cos(first), travel * jnp.sin(first), first + second], axis=-1)
-        floor = scale * self.min_xy * jax.random.normal(k_floor, (*poses.shape[:-1], 2))
-        return compose(poses, step.at[..., :2].add(floor))
+        return compose(poses, step.at[..., :2].add(self.min_xy * noise[..., 3:]))
+
+    def _scale(self, key: Key, shape: tuple[int, ...]) -> Array:
+        """Factor on the standard deviations: one, but for the tail."""
+        if self.tail == 0:
+            return jnp.ones(shape)
+        return jnp.where(jax.random.uniform(key, shape) < self.tail, self.tail_scale, 1.0)
 
     def _share_driven(self, key: Key, shape: tuple[int, ...]) -> Array:
         """Share of the reported translation that was driven: one, but for slips."""

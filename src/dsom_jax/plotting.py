@@ -24,7 +24,7 @@ from dsom_jax.lidar import LidarConfig, scan_points
 from dsom_jax.metrics import Runs, steps_histogram
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.pose_grid import ProbabilityMap
-from dsom_jax.types import Filter
+from dsom_jax.types import Filter, Inputs, Proposal
 
 STYLES = {
     "mcl": ("MCL", "#7f7f7f"),
@@ -49,7 +49,7 @@ FLOOR = 1e-2
 def save(figure: Figure, path: Path) -> None:
     """Write PNG at 150 dpi or PDF, as the ending of ``path`` says, whole or not at all."""
     draft = path.with_name(f".{path.name}")
-    figure.savefig(draft, format=path.suffix[1:], dpi=150, bbox_inches="tight")
+    figure.savefig(draft, format=path.suffix[1:], dpi=150)
     draft.replace(path)
 
 
@@ -186,7 +186,7 @@ def moment_figure(
     estimates: Any,
 ) -> Figure:
     """A filter at updates ``times`` (K,): its particles (K, N, 3), estimates (T, 3), and the PM it drew from."""
-    prepare = jax.jit(filter.prepare)
+    proposal = getattr(filter, "proposal", None)
     views, titles = [], []
     for t, poses in zip(times, np.asarray(particles), strict=True):
         truth = np.asarray(episode.poses[t])
@@ -194,9 +194,16 @@ def moment_figure(
         ends, hit = scan_points(episode.ranges[t], lidar)
         points = transform_points(jnp.asarray(truth if known else estimates[t]), ends)[hit]
         view = {"points": points, "truth": truth if known else None, "estimate": estimates[t], "particles": poses}
-        views.append({"grid": grid, **view, **_pm_of(prepare(jax.tree.map(lambda leaf, t=t: leaf[t], episode.inputs)))})
+        inputs = jax.tree.map(lambda leaf, t=t: leaf[t], episode.inputs)
+        views.append({"grid": grid, **view, **(_pm_of(_prepare(proposal, inputs)) if proposal else {})})
         titles.append(f"update {t}" + (", just kidnapped" if bool(episode.kidnapped[t]) and t else ""))
     return map_views(views, titles)
+
+
+@jax.jit
+def _prepare(proposal: Proposal, inputs: Inputs) -> Any:
+    """What a proposal makes of one scan; compiled once for each kind of proposal."""
+    return proposal.prepare(inputs)
 
 
 def _pm_of(prepared: Any) -> dict[str, Any]:
@@ -262,8 +269,11 @@ def _arrows(ax: Axes, poses: Any, color: str, length: float, label: str, hollow:
     width = length / 1.5
     ax.plot(x, y, "o", color=color, markersize=11 if hollow else 3 * length, markeredgewidth=2 if hollow else 0,
             fillstyle="none" if hollow else "full", label=label, zorder=5, **style)  # fmt: skip
-    tips = x + length * np.cos(theta), y + length * np.sin(theta)
-    ax.plot([x, tips[0]], [y, tips[1]], color=color, linewidth=width, zorder=5, **style)
+    # One broken line: an artist for each stroke takes seconds to draw.
+    gap = np.full_like(x, np.nan)
+    xs = np.stack([x, x + length * np.cos(theta), gap], -1).ravel()
+    ys = np.stack([y, y + length * np.sin(theta), gap], -1).ravel()
+    ax.plot(xs, ys, color=color, linewidth=width, zorder=5, **style)
 
 
 def _metre_ticks(ax: Axes) -> None:

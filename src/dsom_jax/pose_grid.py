@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from dsom_jax.occupancy import OccupancyGrid
-from dsom_jax.resampling import pick
+from dsom_jax.resampling import pick, pick_in_rows
 from dsom_jax.types import Array, Key
 
 
@@ -81,37 +81,50 @@ class ProbabilityMap(NamedTuple):
     Attributes:
         mass: (H, W, K) non-negative, not necessarily normalised.
         cumulative: (H * W,) running sum of the mass of each (i, j).
+        within: (H * W, K) running sum of the mass over the headings of one (i, j).
         pose_grid: where the cells are.
     """
 
     mass: Array
     cumulative: Array
+    within: Array
     pose_grid: PoseGrid
 
 
 def probability_map(pose_grid: PoseGrid, mass: Array) -> ProbabilityMap:
     """PM of masses (H, W, K)."""
-    return ProbabilityMap(mass, jnp.cumsum(mass.sum(-1).reshape(-1)), pose_grid)
+    within = _running_sum(mass.reshape(-1, pose_grid.headings))
+    return ProbabilityMap(mass, jnp.cumsum(within[:, -1]), within, pose_grid)
+
+
+def _running_sum(rows: Array) -> Array:
+    """Running sums along the rows (n, K): a product with a triangle, which is far faster here than ``cumsum``."""
+    triangle = jnp.triu(jnp.ones((rows.shape[1], rows.shape[1]), rows.dtype))
+    return jnp.matmul(rows, triangle, precision=jax.lax.Precision.HIGHEST)
 
 
 def from_log(pose_grid: PoseGrid, log_mass: Array, free: Array) -> ProbabilityMap:
     """PM of unnormalised logarithms (H, W, K), zero where not ``free`` (H, W); uniform over free if nothing is left."""
     masked = jnp.where(free[..., None], log_mass, -jnp.inf)
     top = masked.max()
-    mass = jnp.where(jnp.isfinite(top), jnp.exp(masked - top), jnp.broadcast_to(free[..., None], masked.shape))
+    mass = jnp.where(jnp.isfinite(top), exp_or_zero(masked - top), jnp.broadcast_to(free[..., None], masked.shape))
     return probability_map(pose_grid, mass.astype(jnp.float32))
+
+
+def exp_or_zero(x: Array) -> Array:
+    """exp(x), zero below e-80: numbers that are nearly too small for float32 make processors crawl."""
+    return jnp.where(x > -80.0, jnp.exp(jnp.maximum(x, -80.0)), 0.0)
 
 
 def sample(key: Key, pm: ProbabilityMap, n: int) -> tuple[Array, Array]:
     """``n`` poses (n, 3) drawn from PM, uniform within cell and bin, and their log densities in 1 / (m^2 rad)."""
-    k_cell, k_bin, k_jitter = jax.random.split(key, 3)
-    cell = pick(pm.cumulative, jax.random.uniform(k_cell, (n,)))
-    bins = pm.mass.reshape(-1, pm.pose_grid.headings)[cell]
-    k = jax.vmap(pick)(jnp.cumsum(bins, -1), jax.random.uniform(k_bin, (n,)))
-    jitter = jax.random.uniform(k_jitter, (3, n), minval=-0.5, maxval=0.5)
+    u = jax.random.uniform(key, (5, n))
+    cell = pick(pm.cumulative, u[0])
+    k = pick_in_rows(pm.within, cell, u[1])
+    jitter = u[2:] - 0.5
     i, j = cell // pm.pose_grid.width, cell % pm.pose_grid.width
     poses = cell_pose(pm.pose_grid, i + jitter[0], j + jitter[1], k + jitter[2])
-    mass = jnp.take_along_axis(bins, k[:, None], 1)[:, 0]
+    mass = pm.mass.reshape(-1)[cell * pm.pose_grid.headings + k]
     return poses, jnp.log(mass) - jnp.log(pm.cumulative[-1]) - pm.pose_grid.log_cell_volume
 
 

@@ -22,6 +22,22 @@ def pick(cumulative: Array, positions: Array) -> Array:
     return jnp.searchsorted(cumulative, scaled, side="right", method="scan_unrolled").astype(jnp.int32)
 
 
+def pick_in_rows(cumulative: Array, rows: Array, positions: Array) -> Array:
+    """As :func:`pick`, each of ``positions`` (n,) in its own row ``rows`` (n,) of ``cumulative`` (m, k).
+
+    Bisection that reads one entry at a time: no row is ever copied.
+    """
+    width = cumulative.shape[1]
+    flat, first = cumulative.reshape(-1), rows * width
+    total = flat[first + width - 1]
+    scaled = jnp.minimum(positions * total, jnp.nextafter(total, jnp.zeros_like(total)))
+    found = jnp.zeros_like(rows)
+    for step in (2**power for power in reversed(range(width.bit_length()))):
+        behind = (found + step <= width) & (flat[first + jnp.minimum(found + step, width) - 1] <= scaled)
+        found = jnp.where(behind, found + step, found)
+    return found.astype(jnp.int32)
+
+
 def positions(key: Key, n: int, method: Resampling) -> Array:
     """(n,) positions in [0, 1): one stratum each for ``systematic``, independent for ``multinomial``."""
     if method == "systematic":

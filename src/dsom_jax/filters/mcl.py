@@ -10,7 +10,7 @@ import numpy as np
 
 from dsom_jax.filters.common import Info, ParticleState
 from dsom_jax.filters.updates import Draw, FilterConfig, World, mcl_update, mix, start
-from dsom_jax.types import Inputs, Key
+from dsom_jax.types import Array, Inputs, Key
 
 
 @jax.tree_util.register_dataclass
@@ -39,19 +39,19 @@ class MCL:
     def step(self, key: Key, state: ParticleState, inputs: Inputs, prepared: None) -> tuple[ParticleState, Info]:
         """One update."""
         _, k_update = jax.random.split(key)
-        k_high, k_low, k_spare = jax.random.split(k_update, 3)
+        k_high, k_fresh, _ = jax.random.split(k_update, 3)
         everyone = jnp.ones(self.config.particles, bool)
         moved = mcl_update(k_high, state, everyone, inputs, self.world, self.config)
-        moved = self._inject(k_low, moved, inputs)
-        spare, _ = self.world.space.sample(k_spare, None, self.config.particles)
-        return mix(state, everyone, moved, moved, spare)
+        fresh, _ = self.world.space.sample(k_fresh, None, self.config.particles)
+        moved = self._inject(moved, fresh, inputs)
+        return mix(state, everyone, moved, moved, fresh)
 
-    def _inject(self, key: Key, draw: Draw, inputs: Inputs) -> Draw:
+    def _inject(self, draw: Draw, fresh: Array, inputs: Inputs) -> Draw:
         """Random particles in place of evenly spaced ones (neighbours in the set share an ancestor)."""
         count = round(self.injection * self.config.particles)
         if count == 0:
             return draw
         slots = np.linspace(0, self.config.particles, count, endpoint=False).astype(np.int32)
-        fresh, _ = self.world.space.sample(key, None, count)
+        fresh = fresh[:count]
         weights = self.world.weigh(fresh, inputs.ranges)
         return Draw(draw.poses.at[slots].set(fresh), draw.weights.at[slots].set(weights))

@@ -141,12 +141,14 @@ def _nearest(poses: Array, others: Array, count: int) -> tuple[Array, Array]:
 
     The index replaces the lowest bits of the distance, so that each neighbour is one vectorised minimum.
     """
-    gap = poses[:, None] - others
-    turn = jnp.abs(gap[..., 2])  # below 2 pi, as headings lie in [-pi, pi)
-    squared = gap[..., 0] ** 2 + gap[..., 1] ** 2 + jnp.minimum(turn, 2 * jnp.pi - turn) ** 2
+    # Without the barriers XLA computes particles and distances again for each neighbour.
+    poses, others = jax.lax.optimization_barrier((poses, others))
+    dx, dy, turn = (jnp.abs(poses[:, None, axis] - others[:, axis]) for axis in range(3))
+    squared = dx**2 + dy**2 + jnp.minimum(turn, 2 * jnp.pi - turn) ** 2  # headings lie in [-pi, pi)
     bits = max(1, (others.shape[0] - 1).bit_length())
     low = (1 << bits) - 1
     keys = (jax.lax.bitcast_convert_type(squared, jnp.int32) & ~low) | jnp.arange(others.shape[0], dtype=jnp.int32)
+    keys = jax.lax.optimization_barrier(keys)
     found = [keys.min(-1)]
     for _ in range(count - 1):
         found.append(jnp.where(keys > found[-1][:, None], keys, jnp.iinfo(jnp.int32).max).min(-1))

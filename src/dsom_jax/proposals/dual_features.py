@@ -63,7 +63,7 @@ class DualFeatures:
         gap = (self.features - scan_features(inputs.ranges, self.lidar)) / self.config.bandwidth
         log_weight = -0.5 * (gap**2).sum(-1)
         log_weight = jnp.where(self.updates == inputs.index, -jnp.inf, log_weight)
-        weight = jnp.exp(log_weight - log_weight.max())
+        weight = pg.exp_or_zero(log_weight - log_weight.max())
         mass = jnp.zeros(math.prod(self.pose_grid.shape)).at[self.cells].add(weight, mode="drop")
         return pg.probability_map(self.pose_grid, mass.reshape(self.pose_grid.shape))
 
@@ -99,19 +99,27 @@ def _collect(key: Key, grid: OccupancyGrid, lidar: LidarConfig, config: DualFeat
     cluttered = add_obstacles(k_things, grid, config.obstacles)
     poses, _ = free_space(cluttered).sample(k_pose, None, config.samples // config.layouts)
     ranges = cast_rays(make_tables(cluttered, RaycastConfig("exact"), lidar.range_max), poses, lidar)
-    cells = flat_cells(pg.over(grid, config.headings), poses)
-    return jax.vmap(lambda r: scan_features(r, lidar))(ranges), cells
+    return _described(pg.over(grid, config.headings), ranges, poses, lidar)
+
+
+@partial(jax.jit, static_argnames="lidar")
+def _described(pose_grid: pg.PoseGrid, ranges: Array, poses: Array, lidar: LidarConfig) -> tuple[Array, Array]:
+    """Features (m, 3) of scans (m, B) and the cells (m,) of the poses (m, 3) that they were taken at."""
+    return jax.vmap(lambda r: scan_features(r, lidar))(ranges), flat_cells(pose_grid, poses)
 
 
 def with_episode(proposal: DualFeatures, episode: Episode) -> DualFeatures:
-    """The cheating proposal of Mixture MCL*: the samples contain the test sequence but for the current scan."""
-    features = jax.vmap(lambda r: scan_features(r, proposal.lidar))(episode.ranges)
-    cells = flat_cells(proposal.pose_grid, episode.poses)
+    """The cheating proposal of Mixture MCL*: the samples contain the test sequence but for the current scan.
+
+    The first of the collected samples give way, so that both proposals share one compilation.
+    """
+    features, cells = _described(proposal.pose_grid, episode.ranges, episode.poses, proposal.lidar)
     updates = jnp.arange(len(cells), dtype=jnp.int32)
+    left = min(len(updates), len(proposal.cells))
     return DualFeatures(
-        jnp.concatenate([proposal.features, features]),
-        jnp.concatenate([proposal.cells, cells]),
-        jnp.concatenate([proposal.updates, updates]),
+        jnp.concatenate([proposal.features[left:], features]),
+        jnp.concatenate([proposal.cells[left:], cells]),
+        jnp.concatenate([proposal.updates[left:], updates]),
         proposal.free,
         proposal.pose_grid,
         proposal.lidar,

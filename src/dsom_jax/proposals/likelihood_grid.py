@@ -18,7 +18,7 @@ from dsom_jax.sensor import BeamModel, beam_log_terms
 from dsom_jax.types import Array, Inputs, Key
 
 _LEVELS = 1024
-_BLOCK = 1024  # cells are counted in blocks, so that maps of like size share one compilation
+_BLOCK = 4096  # cells are counted in blocks, so that maps of like size share one compilation
 
 
 @dataclass(frozen=True)
@@ -37,9 +37,9 @@ class LikelihoodGridConfig:
     resolution: float = 0.2
     headings: int = 64
     angles_per_heading: int = 4
-    beams: int = 180
+    beams: int = 120
     raycast: RaycastConfig = RaycastConfig("exact")
-    model: BeamModel = field(default_factory=lambda: BeamModel(sigma_hit=0.2))
+    model: BeamModel = field(default_factory=lambda: BeamModel(sigma_hit=0.15, temper=0.5))
 
 
 @jax.tree_util.register_dataclass
