@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dsom_jax import bench, checkpoint, localize, train
+from dsom_jax import bench, checkpoint, evaluate, localize, train
 from dsom_jax.data import save_tum
 from dsom_jax.errors import UserError, run_cli
 from dsom_jax.nn import DSOMConfig, create
@@ -226,7 +226,7 @@ def test_words_that_cannot_be_read(refused, words, fragments):
     assert all(fragment in error for fragment in fragments), error
 
 
-@pytest.mark.parametrize("main", [bench.main, train.main, localize.main])
+@pytest.mark.parametrize("main", [bench.main, train.main, localize.main, evaluate.main])
 def test_help_is_no_error(main, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["command", "--help"])
     with pytest.raises(SystemExit) as stop:

@@ -83,7 +83,7 @@ def suite(monkeypatch):
             raise UserError(f"--suite {name}: no such suite")
         return made
 
-    def build(name, grid, lidar, *, particles, t_cut, episode, checkpoint):
+    def build(name, grid, lidar, *, particles, t_cut, episode, checkpoint, sources):
         return Oracle(episode.poses, DELAYS[name], particles)
 
     monkeypatch.setattr(bench, "load_suite", load)

@@ -92,6 +92,7 @@ def test_bad_input_is_one_line_and_exit_code_2(files):
     _, errors = process.communicate()
     assert process.returncode == 2
     assert errors.count("error:") == 1 and "nowhere/provenance.json" in errors and "Traceback" not in errors
+    assert not (files / "never").exists()
 
 
 @pytest.mark.parametrize(

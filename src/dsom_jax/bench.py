@@ -21,7 +21,7 @@ from dsom_jax.errors import UserError, run_cli
 from dsom_jax.filters.methods import METHODS, build_filter, needs_checkpoint
 from dsom_jax.montecarlo import Result, run, run_keys, signature
 from dsom_jax.occupancy import OccupancyGrid
-from dsom_jax.types import Filter, Key
+from dsom_jax.types import Filter, Key, Proposal
 
 ESTIMATES = ("mean", "cluster")
 """The weighted mean of the paper, and the mean of the heaviest cluster."""
@@ -89,7 +89,7 @@ class Record(NamedTuple):
     result: Result
 
 
-Build = Callable[[str, OccupancyGrid, Episode], Filter]
+Build = Callable[[str, str, OccupancyGrid, Episode], Filter]
 Advance = Callable[[str, int], None]
 
 
@@ -114,9 +114,12 @@ def collect(
     """Run every method on every sequence; run r of a sequence has the same key for all methods."""
     check_methods(methods, checkpoint)
 
-    def build(name: str, grid: OccupancyGrid, episode: Episode) -> Filter:
+    sources: dict[str, dict[str, Proposal]] = {where: {} for where, _, _ in suite.episodes}
+
+    def build(name: str, where: str, grid: OccupancyGrid, episode: Episode) -> Filter:
         own = {"particles": settings.particles, "t_cut": settings.t_cut, "episode": episode, "checkpoint": checkpoint}
-        return build_filter(name, grid, suite.lidar, **own)
+        filter = build_filter(name, grid, suite.lidar, **own, sources=sources[where])
+        return jax.block_until_ready(filter)
 
     keys = [run_keys(settings.seed, number, settings.runs) for number in range(len(suite.episodes))]
     return {name: run_method(name, suite, keys, build, progress) for name in methods}
@@ -150,7 +153,7 @@ def run_method(name: str, suite: Suite, keys: Sequence[Key], build: Build, progr
         if progress:
             progress(name, number)
         known = number if name in PER_EPISODE else where
-        filter = filters[known] = filters.get(known) or build(name, grid, episode)
+        filter = filters[known] = filters.get(known) or build(name, where, grid, episode)
         result = clock.run(filter, episode, keys[number])
         for estimate, by_phase in parts.items():
             for phase, runs in judge(result, episode, estimate).items():

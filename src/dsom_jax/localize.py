@@ -94,7 +94,7 @@ def main() -> None:
     drives = cut(log, args)
     network = load_network(args, log.lidar)
     folder = report.output_folder(args.out)
-    filter = build(args, grid, log.lidar, drives[0].episode, network)
+    filter = build(args, grid, log.lidar, network)
     with Progress(console=report.terminal(stderr=True)) as progress:
         outcomes = localize(filter, progress.track(drives, description="segments"), args.runs, args.seed)
     summary = summarize(outcomes, grid, args)
@@ -159,11 +159,11 @@ def load_network(args: Args, lidar: LidarConfig) -> Any:
     return checkpoint.load(args.checkpoint, lidar=lidar)
 
 
-def build(args: Args, grid: OccupancyGrid, lidar: LidarConfig, episode: Episode, network: Any = None) -> Filter:
+def build(args: Args, grid: OccupancyGrid, lidar: LidarConfig, network: Any = None) -> Filter:
     """The filter that the arguments ask for."""
     settings = replace(REAL, particles=args.particles, t_cut=args.t_cut, max_beams=args.max_beams, seed=args.seed)
     name = "uniform" if args.method == "mcl" else args.proposal
-    return make_filter(args.method, make_proposal(name, grid, lidar, settings, episode, network), grid, lidar, settings)
+    return make_filter(args.method, make_proposal(name, grid, lidar, settings, network), grid, lidar, settings)
 
 
 def localize(filter: Filter, drives: Any, runs: int, seed: int) -> list[Outcome]:

@@ -49,7 +49,7 @@ FLOOR = 1e-2
 def save(figure: Figure, path: Path) -> None:
     """Write PNG at 150 dpi or PDF, as the ending of ``path`` says, whole or not at all."""
     draft = path.with_name(f".{path.name}")
-    figure.savefig(draft, format=path.suffix[1:], dpi=150)
+    figure.savefig(draft, format=path.suffix[1:], dpi=150, bbox_inches="tight")
     draft.replace(path)
 
 
@@ -128,6 +128,17 @@ def benchmark_figures(
         "converging_steps": step_bars(steps),
         "error_evolution": error_evolution(traces, kidnapped),
     }
+
+
+def calibration_curves(curves: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
+    """Share of truths inside the smallest region that holds probability p, against p: {name: (p, share)}."""
+    figure, (ax,) = _panels(1, 5.0, 4.4)
+    ax.plot([0, 1], [0, 1], color="0.6", linestyle="--", linewidth=1, label="calibrated")
+    for number, (name, (p, share)) in enumerate(curves.items()):
+        ax.plot(p, share, marker=".", color=f"C{number}", label=name)
+    ax.set(xlabel="probability p of the region", ylabel="share of scans whose pose lies inside", aspect="equal")
+    ax.legend(frameon=False, fontsize=8)
+    return figure
 
 
 def map_view(

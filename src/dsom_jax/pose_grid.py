@@ -141,10 +141,13 @@ def log_density(pm: ProbabilityMap, poses: Array) -> Array:
 
 def mass_near(pm: ProbabilityMap, pose: Array, radius: float, angle: float) -> Array:
     """Probability within ``radius`` metres and ``angle`` radians of a pose (3,)."""
-    grid = pm.pose_grid
+    return jnp.where(near(pm.pose_grid, pose, radius, angle), pm.mass, 0.0).sum() / pm.cumulative[-1]
+
+
+def near(grid: PoseGrid, pose: Array, radius: float, angle: float) -> Array:
+    """Which cells (H, W, K) have their centre within ``radius`` metres and ``angle`` radians of a pose (3,)."""
     i, j, k = pose_cell(grid, pose)
     rows, cols = jnp.arange(grid.height)[:, None], jnp.arange(grid.width)
-    near = jnp.hypot(rows - i, cols - j) * grid.resolution <= radius
+    close = jnp.hypot(rows - i, cols - j) * grid.resolution <= radius
     gap = (jnp.arange(grid.headings) - k + grid.headings / 2) % grid.headings - grid.headings / 2
-    mass = jnp.where(near[..., None] & (jnp.abs(gap) * grid.turn <= angle), pm.mass, 0.0)
-    return mass.sum() / pm.cumulative[-1]
+    return close[..., None] & (jnp.abs(gap) * grid.turn <= angle)

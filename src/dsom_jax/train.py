@@ -155,9 +155,12 @@ def open_run(args: Arguments) -> Run:
         return resume_run(args, path)
     if not args.resume and args.out.exists() and any(args.out.iterdir()):
         raise UserError(f"{args.out}: not empty; add --resume to continue that run, or give another --out")
+    run = Run(args.out, read_config(args.config), tuple(str(p) for p in args.maps), args.steps)
+    # Read once before anything is written: a bad map or checkpoint leaves no folder behind.
+    load_maps(args.maps, run.config.model.resolution)
+    load_init(args.init, run.config)
     try:
         args.out.mkdir(parents=True, exist_ok=True)
-        run = Run(args.out, read_config(args.config), tuple(str(p) for p in args.maps), args.steps)
         run.write()
     except OSError as error:
         raise UserError(f"{args.out}: cannot write ({error.strerror}); give another --out") from error
@@ -183,12 +186,17 @@ def first_state(args: Arguments, run: Run) -> TrainState:
     """The newest saved state, or a fresh one."""
     if run.states():
         return checkpoint.load_state(run.states()[-1], init_state(run.config))
-    if args.init is None:
-        return init_state(run.config)
-    model: DSOM = checkpoint.load(args.init)
-    if model.config != run.config.model:
-        raise UserError(f"{args.init}: field model is {model.config}, the run's is {run.config.model}; make them equal")
-    return init_state(run.config, model)
+    return init_state(run.config, load_init(args.init, run.config))
+
+
+def load_init(path: Path | None, config: TrainConfig) -> DSOM | None:
+    """The network to start from, if one is named; it must be of the run's configuration."""
+    if path is None:
+        return None
+    model: DSOM = checkpoint.load(path)
+    if model.config != config.model:
+        raise UserError(f"{path}: field model is {model.config}, the run's is {config.model}; make them equal")
+    return model
 
 
 def trim_log(path: Path, step: int) -> None:

@@ -36,6 +36,7 @@ COMBINATIONS: dict[str, tuple[Algorithm, str]] = {
     "robust_dsom": ("adam_robust", "dsom"),
     "robust_likelihood_grid": ("adam_robust", "likelihood_grid"),
 }
+_STAR = "_star"
 METHODS: tuple[str, ...] = tuple(COMBINATIONS)
 
 
@@ -94,14 +95,20 @@ def build_filter(
     t_cut: float,
     episode: Episode | None = None,
     checkpoint: Any = None,
+    sources: dict[str, Proposal] | None = None,
 ) -> Filter:
     """Filter ``name`` of :data:`METHODS` as the benchmark runs it.
 
-    ``episode`` is needed by ``mixture_mcl_star`` only; ``checkpoint`` is an evaluation view of a DSOM.
+    ``episode`` is needed by ``mixture_mcl_star`` only; ``checkpoint`` is an evaluation view of a DSOM; ``sources``
+    holds the proposals that were made for this map before, by name: what is missing is made and put there.
     """
     algorithm, proposal = COMBINATIONS[name]
     settings = Settings(particles=particles, t_cut=t_cut)
-    source = make_proposal(proposal, grid, lidar, settings, episode, checkpoint)
+    sources, base = {} if sources is None else sources, proposal.removesuffix(_STAR)
+    if base not in sources:
+        sources[base] = make_proposal(base, grid, lidar, settings, checkpoint)
+    starred = episode is not None and proposal.endswith(_STAR)
+    source = with_episode(sources[base], episode) if starred else sources[base]  # type: ignore[arg-type]
     return make_filter(algorithm, source, grid, lidar, settings)
 
 
@@ -110,7 +117,6 @@ def make_proposal(
     grid: OccupancyGrid,
     lidar: LidarConfig,
     settings: Settings,
-    episode: Episode | None = None,
     checkpoint: Any = None,
 ) -> Proposal:
     """Proposal ``name`` on a map."""
@@ -121,12 +127,9 @@ def make_proposal(
         return likelihood_grid(grid, lidar, replace(settings.grid, model=model))
     if name == "dsom":
         return dsom(checkpoint, grid, lidar)
-    if name not in ("dual_features", "dual_features_star"):
-        raise ValueError(f"make_proposal: no proposal is called {name!r}")
-    collected = dual_features(jax.random.key(settings.seed), grid, lidar, DualFeaturesConfig())
-    if name == "dual_features" or episode is None:
-        return collected
-    return with_episode(collected, episode)
+    if name == "dual_features":
+        return dual_features(jax.random.key(settings.seed), grid, lidar, DualFeaturesConfig())
+    raise ValueError(f"make_proposal: no proposal is called {name!r}")
 
 
 def make_filter(
