@@ -39,6 +39,8 @@ class RobustConfig:
             being lost (the trust of the paper, for the set as a whole).
         flatten: share of the resampling distribution that is proportional to sqrt(w) in place of w: improbable
             places live on, at their true weight, until several scans have spoken.
+        caution: share of the log-likelihood that is left out while the filter is wholly lost: one scan alone, of a
+            place that looks like others, is not to decide.
         model: log-likelihood of a scan.
     """
 

@@ -92,7 +92,8 @@ def likelihood_grid(grid: OccupancyGrid, lidar: LidarConfig, config: LikelihoodG
     count = -(-int(coarse.free.sum()) // _BLOCK) * _BLOCK
     cells = jnp.flatnonzero(coarse.free, size=count, fill_value=coarse.free.size).astype(jnp.int32)
     tables = make_tables(grid, config.raycast, config.model.range_max)
-    expected = _expected(tables, _viewpoints(grid, coarse, cells), config)
+    angles = config.headings * config.angles_per_heading
+    expected = _expected(tables, _viewpoints(grid, coarse, cells), angles, config.model.range_max)
     return LikelihoodGrid(pose_grid, coarse.free, cells, expected, lidar, config)
 
 
@@ -121,12 +122,11 @@ def _viewpoints(grid: OccupancyGrid, coarse: OccupancyGrid, cells: Array) -> Arr
     return (jnp.stack([j, i], -1) + 0.5) * grid.resolution
 
 
-@partial(jax.jit, static_argnames="config")
-def _expected(tables: MapTables, points: Array, config: LikelihoodGridConfig) -> Array:
+@partial(jax.jit, static_argnames=("angles", "range_max"))
+def _expected(tables: MapTables, points: Array, angles: int, range_max: float) -> Array:
     """(A, C) uint16 ranges from ``points`` (C, 2) at A directions from -pi on, in the grid's frame."""
-    angles = config.headings * config.angles_per_heading
-    ray = LidarConfig(beams=1, angle_min=0.0, range_max=config.model.range_max)
-    step = (_LEVELS - 1) / config.model.range_max
+    ray = LidarConfig(beams=1, angle_min=0.0, range_max=range_max)
+    step = (_LEVELS - 1) / range_max
 
     def along(heading: Array) -> Array:
         local = jnp.concatenate([points, jnp.broadcast_to(heading, (len(points), 1))], -1)
