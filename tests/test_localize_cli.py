@@ -116,3 +116,10 @@ def test_kidnapping(call, tmp_path):
 def test_the_filter_of_the_paper(call):
     summary, _ = call("--method", "adam", "--t-cut", "0.7")
     assert summary["method"] == "adam" and summary["experiments"] == 8
+
+
+def test_floor_plans_get_models_of_their_own(call):
+    first, _ = call(out="scanned")
+    second, _ = call("--map-kind", "drawn", out="drawn")
+    assert first["converged"] == 1 and second["map_kind"] == "drawn" != first["map_kind"]
+    assert second["e_pos_m_median"] != first["e_pos_m_median"]

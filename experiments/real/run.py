@@ -29,6 +29,8 @@ LOGS = {
     "freiburg-079-half": ("freiburg-079-half", "freiburg-079-half"),
 }
 """Name -> folders of the map and of the log. The floor plan ``walls-only`` has no log of its own."""
+DRAWN = ("walls-only",)
+"""Maps that are floor plans."""
 METHODS = ("adam_robust", "adam")
 ON_MAP = 0.85
 """A segment lies on mapped space if this share of its reference poses is on free cells."""
@@ -90,6 +92,7 @@ def run(job: Job, args: Args, result: Path) -> str | None:
     """Call ``localize`` and keep its summary; the last line of its complaint if it fails."""
     with tempfile.TemporaryDirectory() as folder:
         words = ["--map", job.map, "--log", job.log, "--method", job.method, "--out", folder, "--runs", args.runs]
+        words += ["--map-kind", "drawn" if job.name in DRAWN else "scanned"]
         words += ["--segments", args.segments, "--particles", args.particles, *["--kidnap"] * job.kidnap]
         command = [sys.executable, "-m", "dsom_jax.localize", *map(str, words)]
         done = subprocess.run(command, capture_output=True, text=True)

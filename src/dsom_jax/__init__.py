@@ -21,7 +21,7 @@ _PUBLIC = {
     "filters.adam": ("AdamMCL",),
     "filters.adam_robust": ("AdamRobust", "RobustConfig"),
     "filters.mcl": ("MCL",),
-    "filters.methods": ("METHODS", "REAL", "Settings", "build_filter", "make_filter", "make_proposal"),
+    "filters.methods": ("DRAWN", "METHODS", "REAL", "Settings", "build_filter", "make_filter", "make_proposal"),
     "filters.mixture": ("MixtureMCL",),
     "filters.updates": ("FilterConfig", "World"),
     "geometry": ("compose", "inverse", "relative", "transform_points", "wrap_angle"),

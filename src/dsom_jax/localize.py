@@ -19,7 +19,7 @@ from dsom_jax.data import RawLog, load_log, load_ros_map, save_tum
 from dsom_jax.data.cut import segment_indices, splice, to_episode
 from dsom_jax.episode import Episode
 from dsom_jax.errors import UserError, run_cli
-from dsom_jax.filters.methods import REAL, make_filter, make_proposal
+from dsom_jax.filters.methods import DRAWN, REAL, make_filter, make_proposal
 from dsom_jax.lidar import LidarConfig, apply_limits
 from dsom_jax.montecarlo import Result, run, run_keys
 from dsom_jax.occupancy import OccupancyGrid, is_free
@@ -44,6 +44,8 @@ class Args:
     """Where redrawn particles come from; `mcl` always draws uniformly."""
     checkpoint: Path | None = None
     """Folder of a trained network, for dsom."""
+    map_kind: Literal["scanned", "drawn"] = "scanned"
+    """A map made from scans, or a floor plan that shows walls only."""
     particles: int = 500
     """Particles per run."""
     runs: int = 100
@@ -161,7 +163,8 @@ def load_network(args: Args, lidar: LidarConfig) -> Any:
 
 def build(args: Args, grid: OccupancyGrid, lidar: LidarConfig, network: Any = None) -> Filter:
     """The filter that the arguments ask for."""
-    settings = replace(REAL, particles=args.particles, t_cut=args.t_cut, max_beams=args.max_beams, seed=args.seed)
+    kind = DRAWN if args.map_kind == "drawn" else REAL
+    settings = replace(kind, particles=args.particles, t_cut=args.t_cut, max_beams=args.max_beams, seed=args.seed)
     name = "uniform" if args.method == "mcl" else args.proposal
     return make_filter(args.method, make_proposal(name, grid, lidar, settings, network), grid, lidar, settings)
 
@@ -192,7 +195,8 @@ def summarize(outcomes: list[Outcome], grid: OccupancyGrid, args: Args) -> dict[
     updates = sum(len(o.drive.stamps) for o in outcomes)
     timed = outcomes[1:] or outcomes
     head = {
-        "map": str(args.map), "log": str(args.log), "method": args.method, "proposal": args.proposal,
+        "map": str(args.map), "log": str(args.log), "map_kind": args.map_kind,
+        "method": args.method, "proposal": args.proposal,
         "particles": args.particles, "segments": args.segments, "runs": args.runs, "updates": updates,
         "steps_per_segment": len(outcomes[0].drive.stamps), "seed": args.seed,
         "ms_per_update": 1e3 * float(np.median([o.seconds / len(o.drive.stamps) for o in timed])),
