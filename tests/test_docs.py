@@ -29,7 +29,7 @@ PAGES = [README, *sorted((ROOT / "docs").glob("*.md"))]
 PAPER = (ROOT / "docs" / "paper_to_code.md").read_text()
 LINK = re.compile(r"\[([^\]]*)\]\(([^)#\s]+)\)")
 COMMAND = re.compile(r"python -m dsom_jax\.(\w+) ([^`\n]*)")
-ARGUMENTS = {"bench": "Args", "localize": "Args", "train": "Arguments"}
+ARGUMENTS = {"bench": "Args", "localize": "Args", "train": "Arguments", "evaluate": "Args"}
 
 
 def marked(name: str) -> str:

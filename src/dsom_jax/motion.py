@@ -64,12 +64,16 @@ class OdometryMotion:
 
     def sample(self, key: Key, poses: Array, odometry: Array) -> Array:
         """One successor of each pose (..., 3)."""
-        parts, sigma = self.spread(odometry)
+        shape = poses.shape[:-1]
         k_noise, k_slip, k_tail = jax.random.split(key, 3)
-        scale = self._scale(k_tail, (*poses.shape[:-1], 1))
-        noise = scale * jax.random.normal(k_noise, (*poses.shape[:-1], 5))
+        noise = self._scale(k_tail, (*shape, 1)) * jax.random.normal(k_noise, (*shape, 5))
+        return self.moved(poses, odometry, noise, self._share_driven(k_slip, shape))
+
+    def moved(self, poses: Array, odometry: Array, noise: Array, share: Array | float = 1.0) -> Array:
+        """Successors of poses (..., 3) for standard normal ``noise`` (..., 5) and the ``share`` (...) driven."""
+        parts, sigma = self.spread(odometry)
         first, travel, second = jnp.moveaxis(parts + sigma * noise[..., :3], -1, 0)
-        travel = travel * self._share_driven(k_slip, travel.shape)
+        travel = travel * share
         step = jnp.stack([travel * jnp.cos(first), travel * jnp.sin(first), first + second], axis=-1)
         return compose(poses, step.at[..., :2].add(self.min_xy * noise[..., 3:]))
 

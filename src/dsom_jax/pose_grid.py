@@ -93,6 +93,7 @@ class ProbabilityMap(NamedTuple):
 
 def probability_map(pose_grid: PoseGrid, mass: Array) -> ProbabilityMap:
     """PM of masses (H, W, K)."""
+    mass = mass.astype(jnp.float32)
     within = _running_sum(mass.reshape(-1, pose_grid.headings))
     return ProbabilityMap(mass, jnp.cumsum(within[:, -1]), within, pose_grid)
 
