@@ -12,6 +12,7 @@ import numpy as np
 from dsom_jax import pose_grid as pg
 from dsom_jax.geometry import wrap_angle
 from dsom_jax.occupancy import OccupancyGrid
+from dsom_jax.training import evaluation
 from dsom_jax.training.target import dense, make_target
 from dsom_jax.types import Array, Inputs, Proposal
 
@@ -111,17 +112,8 @@ def judge(proposal: Proposal, grid: OccupancyGrid, ranges: Array, poses: Array) 
 
 def summarise(parts: Quality) -> dict[str, float | int]:
     """Numbers over all scans, as ``evaluate.json`` holds them."""
-    mass = np.asarray(parts.mass, np.float64)
-    return {
-        "scans": int(mass.size),
-        "mass_median": float(np.median(mass)),
-        "mass_mean": float(mass.mean()),
-        "mass_gt_1pct": float((mass > 0.01).mean()),
-        "mass_gt_10pct": float((mass > 0.1).mean()),
-        "top1": float(np.mean(parts.top1)),
-        "kld": float(np.mean(parts.kld)),
-        "peaks_mean": float(np.mean(parts.peaks)),
-    }
+    shares = evaluation.summarise(evaluation.Score(parts.mass, parts.top1))
+    return {**shares, "kld": float(np.mean(parts.kld)), "peaks_mean": float(np.mean(parts.peaks))}
 
 
 def calibration(level: np.ndarray, steps: int = 20) -> tuple[np.ndarray, np.ndarray]:
