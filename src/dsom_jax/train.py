@@ -20,7 +20,7 @@ from dsom_jax.cli import parse
 from dsom_jax.errors import UserError, run_cli
 from dsom_jax.nn import DSOM
 from dsom_jax.occupancy import OccupancyGrid, resample
-from dsom_jax.training.batches import PLAIN, make_batch
+from dsom_jax.training.batches import make_batch, plain
 from dsom_jax.training.evaluation import make_evaluation
 from dsom_jax.training.loop import (
     TrainConfig,
@@ -127,7 +127,7 @@ class Run:
 
     def provenance(self, step: int, metrics: dict[str, Any]) -> dict[str, Any]:
         """How the weights came about."""
-        data = list(self.maps) or "procedural buildings, dsom_jax.simulate.make_world"
+        data = [Path(path).name for path in self.maps] or "procedural buildings, dsom_jax.simulate.make_world"
         facts = {"seed": self.config.seed, "commit": commit(), "data": data, "steps": step, "total": self.total}
         effort = {"seconds": round(self.seconds, 1), "samples": self.samples(step)}
         return {**facts, **effort, "metrics": metrics, "train": asdict(self.config)}
@@ -210,9 +210,9 @@ def trim_log(path: Path, step: int) -> None:
 
 def held_out(run: Run, grids: list[OccupancyGrid]) -> Any:
     """Evaluation on full-size buildings that training does not see."""
-    source = world_source(run.config, run.config.late, grids)
+    scans = plain(run.config.scan)
+    source = world_source(replace(run.config, scan=scans), run.config.late, grids)
     key = jax.random.key(2**31 - 1 - run.config.seed)
-    scans = replace(PLAIN, range_max=run.config.scan.range_max, beams=run.config.scan.beams)
     batch = jax.jit(lambda k: make_batch(k, source, scans, 12, 8))(key)
     return make_evaluation(batch, scans.lidar)
 

@@ -22,6 +22,7 @@ class DSOMConfig:
         scan_size: cells along a side of the scan image of the ``paper`` encoder, 64 or 128.
         range_max: metres; longer ranges count as no return.
         channels: features of one heading bin of the ``polar`` encoder, so that D = K * channels.
+        panorama: compare ``polar`` scans also with what would be seen from every second cell of the map, by ray casting.
         radial_bins: radial basis functions that describe one range to the ``polar`` encoder.
         fov_min: the narrowest scan it was trained for, radians.
         reach_min: the shortest maximal range it was trained for, metres.
@@ -35,6 +36,7 @@ class DSOMConfig:
     scan_size: int = 64
     range_max: float = 10.0
     channels: int = 8
+    panorama: bool = False
     radial_bins: int = 20
     fov_min: float = 2 * math.pi
     reach_min: float = 10.0
@@ -49,6 +51,8 @@ class DSOMConfig:
             raise ValueError(f"DSOMConfig.encoder = {self.encoder!r}: choose polar or paper")
         if self.encoder == "paper" and self.scan_size not in (64, 128):
             raise ValueError(f"DSOMConfig.scan_size = {self.scan_size}: 64 or 128, so that 4 x 4 cells reach the MLP")
+        if self.panorama and self.encoder != "polar":
+            raise ValueError("DSOMConfig.panorama needs encoder polar")
         if not (self.resolution > 0 and self.range_max > 0):
             raise ValueError("DSOMConfig: resolution and range_max are positive metres")
 

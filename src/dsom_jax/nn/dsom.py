@@ -12,8 +12,9 @@ from flax import nnx
 
 from dsom_jax.lidar import LidarConfig, scan_image
 from dsom_jax.nn.config import DSOMConfig
-from dsom_jax.nn.decoder import Decoder
+from dsom_jax.nn.decoder import Decoder, Similarity
 from dsom_jax.nn.encoders import EnvironmentEncoder, PaperScanEncoder, PolarScanEncoder
+from dsom_jax.nn.panorama import PanoramaEncoder
 from dsom_jax.nn.polar import Conditions, polar_features
 from dsom_jax.nn.pooling import pad_to_multiple
 from dsom_jax.nn.similarity import cosine_similarity
@@ -26,19 +27,21 @@ class MapFeatures(NamedTuple):
     Attributes:
         features: M of Eq 2, (h, w, D) with h = ceil(H / 8), w = ceil(W / 8).
         indices: int8 argmax of the three pools, (4h, 4w, w), (2h, 2w, 2w), (h, w, 4w).
+        panorama: (4h, 4w, D) features of the views from every second cell, or None.
         free: (H, W) bool, cells that may receive probability.
     """
 
     features: Array
     indices: tuple[Array, ...]
+    panorama: Array | None
     free: Array
 
 
 class Outputs(NamedTuple):
-    """Logits (N, S, H, W, K) of PM before the softmax, and the scaled SIM (N, S, h, w, K) of the auxiliary loss."""
+    """Logits (N, S, H, W, K) of PM before the softmax, and SIM, for the auxiliary loss."""
 
     logits: Array
-    similarity: Array
+    similarity: Similarity
 
 
 class DSOM(nnx.Module):
@@ -48,9 +51,11 @@ class DSOM(nnx.Module):
         self.config = config
         self.environment = EnvironmentEncoder(config, rng)
         self.scan = PolarScanEncoder(config, rng) if config.encoder == "polar" else PaperScanEncoder(config, rng)
+        self.panorama = PanoramaEncoder(config, rng) if config.panorama else None
         self.decoder = Decoder(config, rng)
-        # Sharpness of a softmax over SIM itself, used by the auxiliary loss only.
+        # Sharpness of a softmax over SIM itself: of the auxiliary loss, and of the panorama's share of the logits.
         self.log_temperature = nnx.Param(jnp.full((), math.log(10.0), jnp.float32))
+        self.log_sharpness = nnx.Param(jnp.full((), math.log(30.0), jnp.float32)) if config.panorama else None
 
     def observation(self, ranges: Array, lidar: LidarConfig, conditions: Conditions | None = None) -> Array:
         """What the scan encoder reads of one scan (B,): polar features (A, C) or the scan image (size, size)."""
@@ -60,17 +65,30 @@ class DSOM(nnx.Module):
         ranges = jnp.where(ranges < limit, ranges, jnp.inf)
         return scan_image(ranges, lidar, self.config.resolution, self.config.scan_size)
 
-    def decode(self, features: Array, indices: tuple[Array, ...], observations: Array) -> Outputs:
-        """Eq 1, 3 and 4 for features (N, h, w, D) of N maps and observations (N, S, ...)."""
+    def encode(self, occupied: Array, free: Array) -> MapFeatures:
+        """Features of maps (N, H, W), H and W multiples of 8: Eq 2, and the panorama."""
+        features, indices = self.environment(occupied)
+        return MapFeatures(features, indices, None if self.panorama is None else self.panorama(occupied), free)
+
+    def similarity(self, maps: MapFeatures, observations: Array) -> Similarity:
+        """Eq 1 and 3, sharpened, for N maps and observations (N, S, ...)."""
         n, s = observations.shape[:2]
         scan = self.scan(observations.reshape(n * s, *observations.shape[2:]))
-        similarity = cosine_similarity(scan.reshape(n, s, *scan.shape[1:]), features[:, None])
-        return Outputs(self.decoder(similarity, indices), similarity * jnp.exp(self.log_temperature[...]))
+        scan = scan.reshape(n, s, *scan.shape[1:])
+        coarse = cosine_similarity(scan, maps.features[:, None]) * jnp.exp(self.log_temperature[...])
+        if maps.panorama is None or self.log_sharpness is None:
+            return Similarity(coarse, None)
+        fine = cosine_similarity(scan, maps.panorama[:, None])
+        return Similarity(coarse, fine * jnp.exp(self.log_sharpness[...]))
+
+    def decode(self, maps: MapFeatures, observations: Array) -> Outputs:
+        """Eq 1, 3 and 4 for N maps and observations (N, S, ...)."""
+        similarity = self.similarity(maps, observations)
+        return Outputs(self.decoder(similarity, maps.indices), similarity)
 
     def __call__(self, occupied: Array, observations: Array) -> Outputs:
         """Maps (N, H, W), H and W multiples of 8, with observations (N, S, ...)."""
-        features, indices = self.environment(occupied)
-        return self.decode(features, indices, observations)
+        return self.decode(self.encode(occupied, ~occupied.astype(bool)), observations)
 
 
 def create(config: DSOMConfig, seed: int = 0) -> DSOM:
@@ -91,9 +109,8 @@ def encode_map(model: DSOM, occupied: Array, free: Array | None = None) -> MapFe
         occupied: (H, W) bool, cells that stop rays; any H and W.
         free: (H, W) bool, where the robot may stand; all that is not occupied if not given.
     """
-    features, indices = model.environment(pad_to_multiple(occupied)[None])
     free = ~occupied.astype(bool) if free is None else free
-    return MapFeatures(features[0], tuple(index[0] for index in indices), free)
+    return jax.tree.map(lambda x: x[0], model.encode(pad_to_multiple(occupied)[None], free[None]))
 
 
 def masked_log_softmax(logits: Array, free: Array) -> Array:
@@ -105,7 +122,10 @@ def masked_log_softmax(logits: Array, free: Array) -> Array:
 
 def log_probability_map(model: DSOM, features: MapFeatures, ranges: Array, lidar: LidarConfig) -> Array:
     """Log PM (H, W, K) of one scan (B,) on one map, theta_k = -pi + k 2pi/K; zero probability off free space."""
-    observation = model.observation(ranges, lidar)
-    indices = tuple(index[None] for index in features.indices)
-    outputs = model.decode(features.features[None], indices, observation[None, None])
-    return masked_log_softmax(outputs.logits[0, 0], features.free)
+    return masked_log_softmax(one_scan(model, features, model.observation(ranges, lidar)), features.free)
+
+
+def one_scan(model: DSOM, features: MapFeatures, observation: Array) -> Array:
+    """Logits (H', W', K) of one scan on one map."""
+    maps = jax.tree.map(lambda x: x[None], features)
+    return model.decode(maps, observation[None, None]).logits[0, 0]

@@ -70,7 +70,8 @@ class PolarScanEncoder(nnx.Module):
             x = block(x)
             if number in (1, 3):
                 x = x.reshape(x.shape[0], -1, 2, x.shape[-1]).max(2)
-        return roll_to_headings(self.project(x))
+        seen = features[..., 0].reshape(x.shape[0], self.headings, -1).mean(-1)
+        return roll_to_headings(self.project(x) * seen[..., None])
 
 
 def roll_to_headings(x: Array) -> Array:

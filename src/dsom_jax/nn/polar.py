@@ -23,6 +23,17 @@ def radial_basis(reach: Array, config: DSOMConfig) -> Array:
     return jnp.maximum(0.0, 1.0 - jnp.abs(reach[..., None] - centres) * config.radial_bins / config.range_max)
 
 
+def range_features(distance: Array, returned: Array, config: DSOMConfig) -> Array:
+    """What is said of one ray: no return, range / range_max, radial basis; (..., 2 + R) of distances (...) in metres."""
+    basis = jnp.where(returned[..., None], radial_basis(distance, config), 0.0)
+    return jnp.concatenate([~returned[..., None], distance[..., None] / config.range_max, basis], axis=-1)
+
+
+def bin_centres(bins: int) -> Array:
+    """(bins,) bearings in the middle of evenly spaced bins from -pi on."""
+    return -jnp.pi + (jnp.arange(bins) + 0.5) * (2 * jnp.pi / bins)
+
+
 def beam_geometry(ranges: Array, lidar: LidarConfig, limit: Array) -> tuple[Array, Array]:
     """Bearing and distance (B,) of the beams' ends seen from the base; a beam without return ends at ``limit``."""
     angles = jnp.asarray(lidar.angles())
@@ -34,9 +45,8 @@ def beam_geometry(ranges: Array, lidar: LidarConfig, limit: Array) -> tuple[Arra
 
 def beam_weights(bearings: Array, gap: Array | float, bins: int) -> Array:
     """Share (bins, B) of each beam in each bearing bin: a hat as wide as a bin or a gap between beams, if wider."""
-    centres = -jnp.pi + (jnp.arange(bins) + 0.5) * (2 * jnp.pi / bins)
     width = jnp.maximum(2 * jnp.pi / bins, 1.01 * gap)
-    return jnp.maximum(0.0, 1.0 - jnp.abs(wrap_angle(centres[:, None] - bearings)) / width)
+    return jnp.maximum(0.0, 1.0 - jnp.abs(wrap_angle(bin_centres(bins)[:, None] - bearings)) / width)
 
 
 class Conditions(NamedTuple):
@@ -70,10 +80,8 @@ def polar_features(
     seen = jnp.isfinite(ranges) | jnp.isposinf(ranges)
     returned = jnp.isfinite(ranges) & (ranges < limit)
     bearings, distance = beam_geometry(ranges, lidar, limit)
-    basis = jnp.where(returned[:, None], radial_basis(distance, config), 0.0)
-    scalars = jnp.stack([~returned, distance / config.range_max], axis=-1)
     weights = beam_weights(bearings, conditions.gap, config.angular_bins) * seen
     total = weights.sum(-1, keepdims=True)
-    features = weights @ jnp.concatenate([scalars, basis], axis=-1) / jnp.maximum(total, 1e-6)
+    features = weights @ range_features(distance, returned, config) / jnp.maximum(total, 1e-6)
     visible = jnp.minimum(total, 1.0)
     return jnp.concatenate([visible, features * visible], axis=-1)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -15,10 +15,21 @@ from dsom_jax.nn.polar import Conditions
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.raycast import RaycastConfig, cast_rays, make_tables
 from dsom_jax.simulate.obstacles import add_obstacles
+from dsom_jax.simulate.worlds import WorldConfig, make_world
 from dsom_jax.types import Array, Key
 
-WorldSource = Callable[[Key], OccupancyGrid]
-"""Draws a building; ``partial(make_world, config=...)`` or :func:`crop_source`."""
+T = TypeVar("T")
+
+
+class Building(NamedTuple):
+    """What the map shows and what a lidar sees; free space of ``seen`` is part of that of ``shown``."""
+
+    shown: OccupancyGrid
+    seen: OccupancyGrid
+
+
+WorldSource = Callable[[Key], Building]
+"""Draws a building; :func:`procedural_source`, :func:`crop_source` or :func:`mixed_source`."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +47,7 @@ class ScanConfig:
         dropout: largest probability of a beam without return.
         short: largest probability of a beam cut short by something unknown.
         obstacles: least and largest number of unknown obstacles per 43 m x 43 m.
+        bare: probability that the map of a procedural building shows its walls only, as floor plans do.
     """
 
     beams: int = 360
@@ -48,6 +60,7 @@ class ScanConfig:
     dropout: float = 0.05
     short: float = 0.1
     obstacles: tuple[int, int] = (0, 40)
+    bare: float = 0.2
 
     @property
     def lidar(self) -> LidarConfig:
@@ -55,7 +68,13 @@ class ScanConfig:
         return LidarConfig(self.beams, -math.pi, 2 * math.pi / self.beams, 0.0, self.range_max)
 
 
-PLAIN = ScanConfig(limited=0.0, thinning=1, sigma=0.02, dropout=0.0, short=0.0, obstacles=(20, 20))
+
+def plain(config: ScanConfig) -> ScanConfig:
+    """Full scans of the lidar of ``config`` with little noise, the map complete but for 20 obstacles per 43 m x 43 m."""
+    return replace(config, limited=0.0, thinning=1, sigma=0.02, dropout=0.0, short=0.0, obstacles=(20, 20), bare=0.0)
+
+
+PLAIN = plain(ScanConfig())
 """The scans that checkpoints are judged by: one full turn, 20 unknown obstacles per 43 m x 43 m."""
 
 
@@ -139,10 +158,39 @@ def make_batch(key: Key, source: WorldSource, config: ScanConfig, worlds: int, s
 
     def one(key: Key) -> Batch:
         k_world, k_scans = jax.random.split(key)
-        grid = source(k_world)
-        return Batch(grid.occupied, grid.free, *make_scans(k_scans, grid, config, scans))
+        shown, seen = source(k_world)
+        return Batch(shown.occupied, shown.free, *make_scans(k_scans, seen, config, scans))
 
     return jax.vmap(one)(jax.random.split(key, worlds))
+
+
+def procedural_source(world: WorldConfig, bare: float) -> WorldSource:
+    """Procedural buildings; with probability ``bare`` the map lacks all that is not a wall."""
+    empty = replace(world, furniture=0.0, pillars=0.0, shelves=0.0)
+
+    def draw(key: Key) -> Building:
+        k_world, k_bare = jax.random.split(key)
+        seen = make_world(k_world, world)
+        if not bare:
+            return Building(seen, seen)
+        return Building(choose(jax.random.uniform(k_bare) < bare, make_world(k_world, empty), seen), seen)
+
+    return draw
+
+
+def mixed_source(first: WorldSource, second: WorldSource, share: float) -> WorldSource:
+    """``first`` with probability ``share``, else ``second``."""
+
+    def draw(key: Key) -> Building:
+        k_which, k_first, k_second = jax.random.split(key, 3)
+        return choose(jax.random.uniform(k_which) < share, first(k_first), second(k_second))
+
+    return draw
+
+
+def choose(condition: Array, first: T, second: T) -> T:
+    """``first`` where ``condition`` () holds, else ``second``, leaf by leaf."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), first, second)
 
 
 class MapPool(NamedTuple):
@@ -165,7 +213,7 @@ def make_pool(grids: list[OccupancyGrid], cells: int) -> MapPool:
 def crop_source(pool: MapPool, cells: int, resolution: float) -> WorldSource:
     """Random square crops of given maps around a free cell, turned by quarters and mirrored at random."""
 
-    def draw(key: Key) -> OccupancyGrid:
+    def draw(key: Key) -> Building:
         k_map, k_cell, k_turn = jax.random.split(key, 3)
         number = jax.random.randint(k_map, (), 0, pool.free.shape[0])
         occupied, free = pool.occupied[number], pool.free[number]
@@ -173,7 +221,8 @@ def crop_source(pool: MapPool, cells: int, resolution: float) -> WorldSource:
         corner = [jnp.clip(c - cells // 2, 0, n - cells) for c, n in zip((y, x), free.shape, strict=True)]
         turn = jax.random.randint(k_turn, (), 0, 8)
         occupied, free = (turned(jax.lax.dynamic_slice(a, corner, (cells, cells)), turn) for a in (occupied, free))
-        return OccupancyGrid(occupied, free, jnp.zeros(3), resolution)
+        grid = OccupancyGrid(occupied, free, jnp.zeros(3), resolution)
+        return Building(grid, grid)
 
     return draw
 

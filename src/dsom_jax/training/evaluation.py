@@ -13,7 +13,7 @@ import numpy as np
 from dsom_jax.geometry import wrap_angle
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.nn import DSOM, encode_map
-from dsom_jax.nn.dsom import masked_log_softmax
+from dsom_jax.nn.dsom import masked_log_softmax, one_scan
 from dsom_jax.training.batches import Batch
 from dsom_jax.training.loop import compiler_options
 from dsom_jax.types import Array
@@ -50,16 +50,14 @@ def score_map(log_pm: Array, pose: Array, resolution: float) -> Score:
 def score_batch(model: DSOM, batch: Batch, lidar: LidarConfig) -> Score:
     """Scores (N, S) of an evaluation view on a batch; maps and scans one after the other, to bound the memory."""
 
-    def one_scan(features, scan) -> Score:
+    def scored(features, scan) -> Score:
         ranges, conditions, pose = scan
-        observation = model.observation(ranges, lidar, conditions)
-        indices = tuple(index[None] for index in features.indices)
-        logits = model.decode(features.features[None], indices, observation[None, None]).logits[0, 0]
+        logits = one_scan(model, features, model.observation(ranges, lidar, conditions))
         return score_map(masked_log_softmax(logits, features.free), pose, model.config.resolution)
 
     def one_map(part: Batch) -> Score:
         features = encode_map(model, part.occupied, part.free)
-        return jax.lax.map(partial(one_scan, features), (part.ranges, part.conditions, part.poses))
+        return jax.lax.map(partial(scored, features), (part.ranges, part.conditions, part.poses))
 
     return jax.lax.map(one_map, batch)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -14,8 +14,17 @@ from flax import nnx
 
 from dsom_jax.nn import DSOM, DSOMConfig, create
 from dsom_jax.occupancy import OccupancyGrid
-from dsom_jax.simulate.worlds import WorldConfig, make_world
-from dsom_jax.training.batches import Batch, ScanConfig, WorldSource, crop_source, make_batch, make_pool
+from dsom_jax.simulate.worlds import WorldConfig
+from dsom_jax.training.batches import (
+    Batch,
+    ScanConfig,
+    WorldSource,
+    crop_source,
+    make_batch,
+    make_pool,
+    mixed_source,
+    procedural_source,
+)
 from dsom_jax.training.loss import Losses, dsom_losses
 from dsom_jax.training.target import make_target
 from dsom_jax.types import Array
@@ -42,7 +51,7 @@ class StageConfig:
 
 def _default_model() -> DSOMConfig:
     """A network that promises what the default scans train it for."""
-    return DSOMConfig(fov_min=ScanConfig.fov_min, reach_min=ScanConfig.reach_min)
+    return DSOMConfig(channels=16, panorama=True, fov_min=ScanConfig.fov_min, reach_min=ScanConfig.reach_min)
 
 
 @dataclass(frozen=True)
@@ -53,12 +62,14 @@ class TrainConfig:
         model: the network.
         scan: simulated scans.
         world: procedural buildings (its ``cells`` and ``resolution`` are taken from the stage and the model).
+        maps_share: where maps are given, the share of buildings that are crops of them; the rest are procedural.
         early: small batches that most steps use.
         late: full-size worlds that the last steps use.
         late_share: share of the steps on ``late``.
         learning_rate: peak of Adam's rate, warm-up then cosine decay to zero.
         warmup: steps to the peak.
         clip: largest norm of the gradient.
+        blur: sigma of the ground truth, cells; the paper's is 3, which spreads a third of PM beyond 1 m of the truth.
         similarity_weight: weight of the cross-entropy on SIM beside Eq 5.
         ema: decay of the averaged weights that are shipped.
         seed: of weights and data.
@@ -67,17 +78,21 @@ class TrainConfig:
     model: DSOMConfig = field(default_factory=lambda: _default_model())
     scan: ScanConfig = ScanConfig()
     world: WorldConfig = WorldConfig()
+    maps_share: float = 1.0
     early: StageConfig = StageConfig()
     late: StageConfig = StageConfig(cells=128, worlds=1, scans=16)
     late_share: float = 0.1
     learning_rate: float = 1e-3
     warmup: int = 100
     clip: float = 5.0
+    blur: float = 1.0
     similarity_weight: float = 1.0
     ema: float = 0.995
     seed: int = 0
 
     def __post_init__(self) -> None:
+        if not 0.0 <= self.maps_share <= 1.0:
+            raise ValueError(f"TrainConfig.maps_share = {self.maps_share}: give a share between 0 and 1")
         if self.model.fov_min < self.scan.fov_min - 1e-6 or self.model.reach_min < self.scan.reach_min - 1e-6:
             raise ValueError("TrainConfig: model.fov_min and model.reach_min promise scans that scan.* does not draw")
 
@@ -139,7 +154,7 @@ def batch_losses(model: DSOM, batch: Batch, config: TrainConfig) -> Losses:
     observations = jax.vmap(jax.vmap(lambda r, c: observe(r, conditions=c)))(batch.ranges, batch.conditions)
     outputs = model(batch.occupied, observations)
     shape = (batch.free.shape[1], batch.free.shape[2])
-    target = make_target(batch.poses, shape, config.model.headings, config.model.resolution)
+    target = make_target(batch.poses, shape, config.model.headings, config.model.resolution, config.blur)
     return dsom_losses(outputs, target, batch.free, config.similarity_weight)
 
 
@@ -175,11 +190,13 @@ def compiler_options() -> dict[str, str]:
 
 
 def world_source(config: TrainConfig, stage: StageConfig, grids: list[OccupancyGrid] | None = None) -> WorldSource:
-    """Procedural buildings, or crops of ``grids``, which have the model's resolution."""
-    if grids:
-        return crop_source(make_pool(grids, stage.cells), stage.cells, config.model.resolution)
-    world = WorldConfig(**{**vars(config.world), "cells": stage.cells, "resolution": config.model.resolution})
-    return partial(make_world, config=world)
+    """Procedural buildings, crops of ``grids``, which have the model's resolution, or some of both."""
+    world = replace(config.world, cells=stage.cells, resolution=config.model.resolution)
+    procedural = procedural_source(world, config.scan.bare)
+    if not grids:
+        return procedural
+    crops = crop_source(make_pool(grids, stage.cells), stage.cells, config.model.resolution)
+    return crops if config.maps_share == 1.0 else mixed_source(crops, procedural, config.maps_share)
 
 
 def make_batches(config: TrainConfig, grids: list[OccupancyGrid] | None = None) -> Callable[[int, int], Batch]:

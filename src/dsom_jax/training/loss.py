@@ -50,7 +50,13 @@ def dsom_losses(outputs: Outputs, target: Target, free: Array, similarity_weight
     """Losses of a batch: outputs for N maps x S scans, target factors (N, S, .), free (N, H, W)."""
     free = free[:, None]
     main = kld(outputs.logits, dense(target, free), free).mean()
-    n, _, h, w = free.shape
-    coarse_free = free.reshape(n, 1, h // 8, 8, w // 8, 8).any((3, 5))
-    side = cross_entropy(outputs.similarity, pooled(target, free), coarse_free).mean()
+    side = sum(similarity_loss(part, target, free) for part in outputs.similarity if part is not None)
     return Losses(main + similarity_weight * side, main, side)
+
+
+def similarity_loss(similarity: Array, target: Target, free: Array) -> Array:
+    """Mean cross-entropy of softmax(SIM), SIM (N, S, h, w, K), and the ground truth pooled to its cells."""
+    factor = free.shape[-1] // similarity.shape[-2]
+    n, _, h, w = free.shape
+    coarse_free = free.reshape(n, 1, h // factor, factor, w // factor, factor).any((3, 5))
+    return cross_entropy(similarity, pooled(target, free, factor), coarse_free).mean()

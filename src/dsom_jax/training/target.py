@@ -27,10 +27,10 @@ class Target(NamedTuple):
     headings: Array
 
 
-def blurred_one_hot(position: Array, size: int) -> Array:
-    """One-hot of the cell around ``position`` (...), in cells, blurred over 7 cells with sigma 3: (..., size)."""
+def blurred_one_hot(position: Array, size: int, sigma: float = SIGMA) -> Array:
+    """One-hot of the cell around ``position`` (...), in cells, blurred over 7 cells with ``sigma``: (..., size)."""
     offset = jnp.arange(size) - jnp.floor(position)[..., None]
-    weights = jnp.where(jnp.abs(offset) <= RADIUS, jnp.exp(-0.5 * (offset / SIGMA) ** 2), 0.0)
+    weights = jnp.where(jnp.abs(offset) <= RADIUS, jnp.exp(-0.5 * (offset / sigma) ** 2), 0.0)
     return weights / weights.sum(-1, keepdims=True)
 
 
@@ -44,11 +44,16 @@ def heading_weights(theta: Array, headings: int) -> Array:
     return jnp.maximum(0.0, 1.0 - distance)
 
 
-def make_target(poses: Array, shape: tuple[int, int], headings: int, resolution: float) -> Target:
-    """Factors of GT for poses (..., 3) in the grid's own frame (metres from its lower-left corner, radians)."""
+def make_target(
+    poses: Array, shape: tuple[int, int], headings: int, resolution: float, sigma: float = SIGMA
+) -> Target:
+    """Factors of GT for poses (..., 3) in the grid's own frame (metres from its lower-left corner, radians).
+
+    ``sigma`` is the blur in cells; the paper's is 3.
+    """
     return Target(
-        blurred_one_hot(poses[..., 1] / resolution, shape[0]),
-        blurred_one_hot(poses[..., 0] / resolution, shape[1]),
+        blurred_one_hot(poses[..., 1] / resolution, shape[0], sigma),
+        blurred_one_hot(poses[..., 0] / resolution, shape[1], sigma),
         heading_weights(poses[..., 2], headings),
     )
 
