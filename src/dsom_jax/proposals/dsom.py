@@ -35,6 +35,11 @@ class DSOMProposal:
     graph: Any = field(metadata={"static": True})
     lidar: LidarConfig = field(metadata={"static": True})
 
+    @property
+    def free(self) -> Array:
+        """(H, W) bool, cells of PM with free space."""
+        return self.features.free
+
     def prepare(self, inputs: Inputs) -> pg.ProbabilityMap:
         """One pass of the scan encoder and the decoder."""
         log_pm = log_probability_map(nnx.merge(self.graph, self.weights), self.features, inputs.ranges, self.lidar)

@@ -47,6 +47,9 @@ class ScanConfig:
         dropout: largest probability of a beam without return.
         short: largest probability of a beam cut short by something unknown.
         obstacles: least and largest number of unknown obstacles per 43 m x 43 m.
+        depth: least and largest distance behind the mapped edge of a wall at which the beams of a scan end, metres: coarse
+            cells of real maps begin before their walls.
+        deep: probability that a scan has such a depth.
         bare: probability that the map of a procedural building shows its walls only, as floor plans do.
     """
 
@@ -60,6 +63,8 @@ class ScanConfig:
     dropout: float = 0.05
     short: float = 0.1
     obstacles: tuple[int, int] = (0, 40)
+    depth: tuple[float, float] = (-0.1, 0.35)
+    deep: float = 0.5
     bare: float = 0.2
 
     @property
@@ -71,7 +76,8 @@ class ScanConfig:
 
 def plain(config: ScanConfig) -> ScanConfig:
     """Full scans of the lidar of ``config`` with little noise, the map complete but for 20 obstacles per 43 m x 43 m."""
-    return replace(config, limited=0.0, thinning=1, sigma=0.02, dropout=0.0, short=0.0, obstacles=(20, 20), bare=0.0)
+    quiet = replace(config, sigma=0.02, dropout=0.0, short=0.0, deep=0.0)
+    return replace(quiet, limited=0.0, thinning=1, obstacles=(20, 20), bare=0.0)
 
 
 PLAIN = plain(ScanConfig())
@@ -130,9 +136,16 @@ def random_noise(key: Key, config: ScanConfig) -> LidarNoise:
     return LidarNoise(**values)  # type: ignore[arg-type]  # traced numbers
 
 
+def random_depth(key: Key, config: ScanConfig) -> Array:
+    """How far behind the mapped edge of walls the beams of one scan end (), metres."""
+    r = jax.random.uniform(key, (2,))
+    return jnp.where(r[0] < config.deep, config.depth[0] + (config.depth[1] - config.depth[0]) * r[1], 0.0)
+
+
 def spoil_scan(key: Key, ranges: Array, config: ScanConfig) -> tuple[Array, Conditions]:
     """A clean scan (B,) with noise, reach, view and thinning of its own."""
-    k_conditions, k_noise, k_observe = jax.random.split(key, 3)
+    k_conditions, k_noise, k_observe, k_depth = jax.random.split(key, 4)
+    ranges = jnp.maximum(ranges + random_depth(k_depth, config), 0.0)
     conditions, present = random_conditions(k_conditions, config)
     ranges = observe(k_observe, ranges, config.lidar, random_noise(k_noise, config))
     ranges = jnp.where(ranges < conditions.reach, ranges, jnp.inf)
