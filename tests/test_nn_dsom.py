@@ -16,6 +16,7 @@ from dsom_jax.nn import DSOMConfig, create, encode_map, evaluation_view, log_pro
 LIDAR = LidarConfig(beams=36, angle_increment=2 * np.pi / 36)
 CONFIGS = {
     "polar": DSOMConfig(width=2, headings=4),
+    "panorama": DSOMConfig(width=2, headings=4, panorama=True),
     "paper": DSOMConfig(width=2, headings=4, encoder="paper", paper_head=True),
 }
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -10,12 +11,16 @@ import numpy as np
 import pytest
 
 from dsom_jax.occupancy import from_cells
+from dsom_jax.simulate.worlds import WorldConfig
 from dsom_jax.training.batches import (
     PLAIN,
+    Building,
     ScanConfig,
     crop_source,
     make_batch,
     make_pool,
+    mixed_source,
+    procedural_source,
     random_poses,
     spoil_scan,
     turned,
@@ -61,6 +66,34 @@ def test_spoiled_scans_keep_to_their_conditions():
 def test_plain_scans_are_whole():
     ranges, _ = spoil_scan(jax.random.key(0), jnp.full(360, 3.0), PLAIN)
     assert jnp.isfinite(ranges).all() and jnp.abs(ranges - 3.0).max() < 6 * PLAIN.sigma
+
+
+def test_floor_plans_show_part_of_what_the_lidar_sees():
+    world = WorldConfig(cells=48)
+    shown, seen = jax.jit(procedural_source(world, bare=1.0))(jax.random.key(3))
+    assert shown.occupied.sum() < seen.occupied.sum()
+    assert not (seen.free & ~shown.free).any()
+    shown, seen = jax.jit(procedural_source(world, bare=0.0))(jax.random.key(3))
+    jax.tree.map(np.testing.assert_array_equal, shown, seen)
+
+
+def test_mixed_source_draws_from_both_as_often_as_asked():
+    def constant(value):
+        grid = from_cells(jnp.full((2, 2), value), resolution=0.5)
+        return lambda key: Building(grid, grid)
+
+    draw = jax.jit(jax.vmap(lambda key: mixed_source(constant(True), constant(False), 0.25)(key).shown.occupied.all()))
+    drawn = int(draw(jax.random.split(jax.random.key(0), 2000)).sum())
+    # Five standard deviations of a binomial with p = 1/4.
+    assert abs(drawn - 500) < 5 * math.sqrt(2000 * 3 / 16)
+
+
+def test_depth_behind_walls_is_one_number_for_a_scan():
+    config = replace(PLAIN, sigma=0.0, deep=1.0, depth=(0.1, 0.3))
+    for seed in range(4):
+        ranges, _ = spoil_scan(jax.random.key(seed), jnp.full(360, 3.0), config)
+        assert 3.1 - 1e-5 <= float(ranges[0]) <= 3.3 + 1e-5
+        np.testing.assert_allclose(ranges, ranges[0], atol=1e-6)
 
 
 def test_eight_symmetries():

@@ -26,6 +26,20 @@ def test_ground_truth_equals_the_loops(pose):
     np.testing.assert_allclose(truth, ground_truth(pose, SHAPE, HEADINGS, RESOLUTION), atol=1e-6)
 
 
+@pytest.mark.parametrize(("blur", "share"), [(3.0, 0.69), (1.0, 0.99), (0.1, 1.0)])
+def test_blur_decides_how_much_truth_lies_within_three_cells(blur, share):
+    truth = np.asarray(dense(make_target(jnp.asarray((6.25, 4.25, 0.0)), SHAPE, HEADINGS, RESOLUTION, blur), FREE))
+    i, j = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    close = np.hypot(i - 8, j - 12) <= 3
+    # By hand: 29 of the 49 cells of the blur lie within three cells of its middle.
+    weights = np.exp(-0.5 * (np.arange(-3, 4) / blur) ** 2)
+    plane = np.outer(weights, weights) / weights.sum() ** 2
+    a, b = np.mgrid[-3:4, -3:4]
+    expected = plane[np.hypot(a, b) <= 3].sum()
+    assert abs(expected - share) < 0.02
+    np.testing.assert_allclose(truth.sum(-1)[close].sum(), expected, atol=1e-5)
+
+
 @settings(max_examples=30, deadline=None)
 @given(st.floats(-3.14, 3.14))
 def test_heading_weights_average_to_the_heading(theta):

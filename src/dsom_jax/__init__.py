@@ -34,6 +34,7 @@ _PUBLIC = {
     "pose_grid": ("PoseGrid", "ProbabilityMap", "probability_map"),
     "proposals.dsom": ("DSOMProposal", "dsom"),
     "proposals.dual_features": ("DualFeatures", "DualFeaturesConfig", "dual_features", "with_episode"),
+    "proposals.hybrid": ("Hybrid", "HybridConfig"),
     "proposals.likelihood_grid": ("LikelihoodGrid", "LikelihoodGridConfig", "likelihood_grid"),
     "proposals.uniform": ("FreeSpace", "free_space"),
     "raycast": ("MapTables", "RaycastConfig", "cast_rays", "make_tables"),

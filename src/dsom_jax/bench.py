@@ -18,7 +18,7 @@ from dsom_jax.cli import parse
 from dsom_jax.data.suite import Suite, load_suite
 from dsom_jax.episode import Episode
 from dsom_jax.errors import UserError, run_cli
-from dsom_jax.filters.methods import METHODS, build_filter, needs_checkpoint
+from dsom_jax.filters.methods import METHODS, STANDARD, build_filter, needs_checkpoint
 from dsom_jax.montecarlo import Result, run, run_keys, signature
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.types import Filter, Key, Proposal
@@ -136,9 +136,9 @@ def check_methods(methods: Sequence[str], checkpoint: Any = None) -> None:
 
 
 def chosen_methods(names: str, checkpoint: Path | None) -> tuple[str, ...]:
-    """The methods of a comma-separated list; an empty one means all that can be run."""
+    """The methods of a comma-separated list; an empty one means the standard ones that can be run."""
     methods = tuple(dict.fromkeys(name.strip() for name in names.split(",") if name.strip()))
-    methods = methods or tuple(name for name in METHODS if checkpoint or not needs_checkpoint(name))
+    methods = methods or tuple(name for name in STANDARD if checkpoint or not needs_checkpoint(name))
     check_methods(methods, checkpoint)
     return methods
 

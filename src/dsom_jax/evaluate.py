@@ -29,7 +29,7 @@ from dsom_jax.training import quality
 from dsom_jax.training.batches import PLAIN, ScanConfig, make_scans
 from dsom_jax.types import Array, Key, Proposal
 
-PROPOSALS = ("uniform", "dual_features", "dsom", "likelihood_grid")
+PROPOSALS = ("uniform", "dual_features", "dsom", "likelihood_grid", "hybrid")
 WORST = 5
 _UNSEEN = 0x5EE0
 """Folded into the seed, so that these worlds are none of those that training draws."""
@@ -172,7 +172,7 @@ def draw(
     """Calibration of all proposals; for the two that are worth it, the worst scans and the first ones."""
     curves = {name: quality.calibration(np.asarray(part.level)) for name, part in parts.items()}
     plotting.save(plotting.calibration_curves(curves), folder / "calibration.png")
-    for name in ("dsom", "likelihood_grid"):
+    for name in ("dsom", "likelihood_grid", "hybrid"):
         worst = np.argsort(parts[name].mass, kind="stable")[:WORST]
         for title, chosen in (("worst", worst), ("first", np.arange(min(WORST, len(parts[name].mass))))):
             views = [view(name, scenes, int(n), lidar, network) for n in chosen]

@@ -40,7 +40,7 @@ class Args:
     """TUM trajectory of the base in the map frame; default: the log's own, where it has one."""
     method: Literal["adam_robust", "adam", "mcl", "mixture_mcl"] = "adam_robust"
     """Particle filter."""
-    proposal: Literal["likelihood_grid", "dsom", "uniform", "dual_features"] = "likelihood_grid"
+    proposal: Literal["likelihood_grid", "dsom", "hybrid", "uniform", "dual_features"] = "likelihood_grid"
     """Where redrawn particles come from; `mcl` always draws uniformly."""
     checkpoint: Path | None = None
     """Folder of a trained network, for dsom."""
@@ -117,7 +117,7 @@ def check(args: Args) -> None:
         raise UserError(f"--steps-per-segment {args.steps_per_segment}: give at least 6, or 0 for the whole log")
     if not 0 < args.t_cut < 1:
         raise UserError(f"--t-cut {args.t_cut}: give a number between 0 and 1 (the paper uses 0.6)")
-    if args.proposal == "dsom" and args.method != "mcl" and args.checkpoint is None:
+    if args.proposal in ("dsom", "hybrid") and args.method != "mcl" and args.checkpoint is None:
         raise UserError(f"--proposal {args.proposal}: give --checkpoint, the folder of a trained network")
     if args.kidnap and args.segments < 2:
         raise UserError(f"--segments {args.segments}: --kidnap joins two segments, give at least 2")

@@ -20,7 +20,7 @@ from dsom_jax.occupancy import OccupancyGrid, inside
 from dsom_jax.types import Array
 
 _NUDGE = 1e-3  # cells; larger than float32 rounding at 4,000 cells, smaller than anything a lidar resolves
-_FIRST_STEPS, _MORE_STEPS, _GROUP = 6, 8, 64
+_FIRST_STEPS, _MORE_STEPS, _GROUP = 4, 4, 16
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ def march(squares: Array, x: Array, y: Array, dx: Array, dy: Array, limit: float
     """Distance in cells along rays from (x, y) to the first occupied cell; inf from ``limit`` on or off the map.
 
     Every step leaps out of the largest empty square ahead. All rays take a few steps together; the few that are still
-    under way (grazing a wall) are then taken up one per group of 64, so that they do not hold up the rest.
+    under way (grazing a wall) are then taken up one per group of 16, so that they do not hold up the rest.
     """
     shape = jnp.broadcast_shapes(x.shape, dx.shape)
     known = inside((squares.shape[1] - 2, squares.shape[2] - 2), y, x)

@@ -18,6 +18,7 @@ from dsom_jax.motion import OdometryMotion
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.proposals.dsom import dsom
 from dsom_jax.proposals.dual_features import DualFeaturesConfig, dual_features, with_episode
+from dsom_jax.proposals.hybrid import Hybrid, HybridConfig
 from dsom_jax.proposals.likelihood_grid import LikelihoodGridConfig, likelihood_grid
 from dsom_jax.proposals.uniform import free_space
 from dsom_jax.raycast import RaycastConfig, make_tables
@@ -33,16 +34,21 @@ COMBINATIONS: dict[str, tuple[Algorithm, str]] = {
     "mixture_mcl_dsom": ("mixture_mcl", "dsom"),
     "adam_dsom": ("adam", "dsom"),
     "adam_likelihood_grid": ("adam", "likelihood_grid"),
+    "adam_hybrid": ("adam", "hybrid"),
     "robust_dsom": ("adam_robust", "dsom"),
     "robust_likelihood_grid": ("adam_robust", "likelihood_grid"),
+    "robust_hybrid": ("adam_robust", "hybrid"),
 }
 _STAR = "_star"
+PARTS = {"hybrid": ("likelihood_grid", "dsom")}
 METHODS: tuple[str, ...] = tuple(COMBINATIONS)
+STANDARD: tuple[str, ...] = tuple(name for name in METHODS if COMBINATIONS[name][1] not in PARTS)
+"""Methods of the standard comparison; the others have to be asked for by name."""
 
 
 def needs_checkpoint(method: str) -> bool:
     """Whether a method of :data:`METHODS` draws from a trained network."""
-    return COMBINATIONS[method][1] == "dsom"
+    return COMBINATIONS[method][1].endswith(("dsom", "hybrid"))
 
 
 @dataclass(frozen=True)
@@ -56,6 +62,7 @@ class Settings:
         seed: of what is random while a filter is built (the samples of Mixture MCL).
         motion, score, raycast: drive, Eq 15 and expected ranges of the paper's filters.
         grid: the likelihood grid.
+        hybrid: weights of likelihood grid and network.
         robust, robust_motion, robust_raycast: AdaM robust; its ``particles`` are those above.
     """
 
@@ -67,6 +74,7 @@ class Settings:
     score: ScoreModel = ScoreModel()
     raycast: RaycastConfig = RaycastConfig("table")
     grid: LikelihoodGridConfig = LikelihoodGridConfig()
+    hybrid: HybridConfig = HybridConfig()
     robust: RobustConfig = RobustConfig(model=BeamModel(0.65, 0.05, 0.05, 0.25, sigma_hit=0.1, temper=0.2))
     robust_motion: Motion = OdometryMotion(0.01, 0.01, 0.01, 0.01, 0.02, 0.015, slip=0.1, tail=0.4, tail_scale=4.0)
     robust_raycast: RaycastConfig = RaycastConfig("table")
@@ -113,8 +121,9 @@ def build_filter(
     algorithm, proposal = COMBINATIONS[name]
     settings = Settings(particles=particles, t_cut=t_cut)
     sources, base = {} if sources is None else sources, proposal.removesuffix(_STAR)
-    if base not in sources:
-        sources[base] = make_proposal(base, grid, lidar, settings, checkpoint)
+    for needed in (*PARTS.get(base, ()), base):
+        if needed not in sources:
+            sources[needed] = make_proposal(needed, grid, lidar, settings, checkpoint, sources)
     starred = episode is not None and proposal.endswith(_STAR)
     source = with_episode(sources[base], episode) if starred else sources[base]  # type: ignore[arg-type]
     return make_filter(algorithm, source, grid, lidar, settings)
@@ -126,8 +135,9 @@ def make_proposal(
     lidar: LidarConfig,
     settings: Settings,
     checkpoint: Any = None,
+    made: dict[str, Proposal] | None = None,
 ) -> Proposal:
-    """Proposal ``name`` on a map."""
+    """Proposal ``name`` on a map; one that is put together of others takes those that are ``made`` already."""
     if name == "uniform":
         return free_space(grid)
     if name == "likelihood_grid":
@@ -135,6 +145,10 @@ def make_proposal(
         return likelihood_grid(grid, lidar, replace(settings.grid, model=model))
     if name == "dsom":
         return dsom(checkpoint, grid, lidar)
+    if name == "hybrid":
+        have = made or {}
+        parts: Any = [have.get(p) or make_proposal(p, grid, lidar, settings, checkpoint) for p in PARTS[name]]
+        return Hybrid(*parts, settings.hybrid)
     if name == "dual_features":
         return dual_features(jax.random.key(settings.seed), grid, lidar, DualFeaturesConfig())
     raise ValueError(f"make_proposal: no proposal is called {name!r}")

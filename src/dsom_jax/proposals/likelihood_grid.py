@@ -67,7 +67,10 @@ class LikelihoodGrid:
 
     def prepare(self, inputs: Inputs) -> pg.ProbabilityMap:
         """PM of one scan (B,): softmax of the tempered log-likelihood over all free cells."""
-        log_mass = self.log_likelihood(inputs.ranges)
+        return self.probability_map(self.log_likelihood(inputs.ranges))
+
+    def probability_map(self, log_mass: Array) -> pg.ProbabilityMap:
+        """PM of unnormalised logarithms (C, K) at the free cells."""
         full = jnp.full((self.free.size, self.config.headings), -jnp.inf).at[self.cells].set(log_mass, mode="drop")
         return pg.from_log(self.pose_grid, full.reshape(self.pose_grid.shape), self.free)
 

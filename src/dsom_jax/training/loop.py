@@ -191,12 +191,14 @@ def compiler_options() -> dict[str, str]:
 
 def world_source(config: TrainConfig, stage: StageConfig, grids: list[OccupancyGrid] | None = None) -> WorldSource:
     """Procedural buildings, crops of ``grids``, which have the model's resolution, or some of both."""
+    if grids and config.maps_share == 1.0:
+        return crop_source(make_pool(grids, stage.cells), stage.cells, config.model.resolution)
     world = replace(config.world, cells=stage.cells, resolution=config.model.resolution)
     procedural = procedural_source(world, config.scan.bare)
     if not grids:
         return procedural
     crops = crop_source(make_pool(grids, stage.cells), stage.cells, config.model.resolution)
-    return crops if config.maps_share == 1.0 else mixed_source(crops, procedural, config.maps_share)
+    return mixed_source(crops, procedural, config.maps_share)
 
 
 def make_batches(config: TrainConfig, grids: list[OccupancyGrid] | None = None) -> Callable[[int, int], Batch]:

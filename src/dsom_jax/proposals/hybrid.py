@@ -1,0 +1,88 @@
+"""Likelihood and learning together: the likelihood grid's evidence times the probability map of DSOM."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import jax
+import jax.numpy as jnp
+
+from dsom_jax import pose_grid as pg
+from dsom_jax.geometry import compose
+from dsom_jax.proposals.dsom import DSOMProposal
+from dsom_jax.proposals.likelihood_grid import LikelihoodGrid
+from dsom_jax.types import Array, Inputs, Key
+
+
+@dataclass(frozen=True)
+class HybridConfig:
+    """Weights of the logarithmic pool log PM = evidence * log L + network * log PM_DSOM (``experiments/dsom``).
+
+    Attributes:
+        evidence: exponent of the tempered likelihood.
+        network: exponent of DSOM's probability.
+        floor: share of DSOM's probability that is spread evenly, so that it cannot veto a place.
+    """
+
+    evidence: float = 1.0
+    network: float = 1.0
+    floor: float = 0.01
+
+    def __post_init__(self) -> None:
+        if self.evidence < 0 or self.network < 0 or not 0 < self.floor < 1:
+            raise ValueError("HybridConfig: evidence and network must not be negative, floor lies between 0 and 1")
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Hybrid:
+    """Proposal on the cells of a likelihood grid.
+
+    Attributes:
+        likelihood: training-free evidence.
+        network: trained proposal on the same map.
+        config: static.
+    """
+
+    likelihood: LikelihoodGrid
+    network: DSOMProposal
+    config: HybridConfig = field(default=HybridConfig(), metadata={"static": True})
+
+    @property
+    def free(self) -> Array:
+        """(H, W) bool, cells of PM with free space."""
+        return self.likelihood.free
+
+    def prepare(self, inputs: Inputs) -> pg.ProbabilityMap:
+        """The pool of both for one scan (B,)."""
+        evidence = self.config.evidence * self.likelihood.log_likelihood(inputs.ranges)
+        learnt = self.config.network * self.log_network(inputs)
+        return self.likelihood.probability_map(evidence + learnt)
+
+    def log_network(self, inputs: Inputs) -> Array:
+        """(C, K) log of DSOM's probability, with its floor, at the cells of the likelihood grid."""
+        pm = self.network.prepare(inputs)
+        even = self.config.floor / jnp.maximum(self.network.free.sum() * pm.pose_grid.headings, 1)
+        log_pm = jnp.log((1 - self.config.floor) * pm.mass / pm.cumulative[-1] + even)
+        layers = jnp.moveaxis(log_pm, -1, 0).reshape(pm.pose_grid.headings, -1)
+        grid, x, y = self.likelihood.pose_grid, *self.likelihood.lidar.mount[:2]
+        i, j = jnp.divmod(jnp.minimum(self.likelihood.cells, self.free.size - 1), grid.width)
+
+        def one_heading(k: Array) -> Array:
+            sensor = pg.cell_pose(grid, i, j, jnp.broadcast_to(k, i.shape))
+            return interpolate_headings(layers, pm.pose_grid, compose(sensor, jnp.array([-x, -y, 0.0])))
+
+        return jax.lax.map(one_heading, jnp.arange(grid.headings)).T
+
+    def sample(self, key: Key, prepared: pg.ProbabilityMap, n: int) -> tuple[Array, Array]:
+        """``n`` base poses (n, 3) from PM and their log densities."""
+        return self.likelihood.sample(key, prepared, n)
+
+
+def interpolate_headings(layers: Array, grid: pg.PoseGrid, poses: Array) -> Array:
+    """Values (C,) of ``layers`` (K, H * W) at poses (C, 3): nearest cell, linear between the two nearest headings."""
+    i, j, k = pg.pose_cell(grid, poses)
+    i, j = (jnp.clip(jnp.round(v), 0, n - 1).astype(jnp.int32) for v, n in ((i, grid.height), (j, grid.width)))
+    low = jnp.floor(k).astype(jnp.int32)
+    flat, share = i * grid.width + j, k - low
+    return (1 - share) * layers[low % grid.headings, flat] + share * layers[(low + 1) % grid.headings, flat]

@@ -1,0 +1,102 @@
+"""The hybrid proposal: equal to each of its parts where the other has no weight, and a product where both have."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import tiny_world
+from dsom_jax import pose_grid as pg
+from dsom_jax.geometry import compose
+from dsom_jax.nn import DSOMConfig, create, evaluation_view
+from dsom_jax.occupancy import is_free
+from dsom_jax.proposals.dsom import dsom
+from dsom_jax.proposals.hybrid import Hybrid, HybridConfig, interpolate_headings
+from dsom_jax.proposals.likelihood_grid import LikelihoodGridConfig, likelihood_grid
+from dsom_jax.sensor import BeamModel
+from dsom_jax.types import Inputs
+
+LIDAR = tiny_world.LIDAR
+MODEL = BeamModel(sigma_hit=0.2, temper=0.2, range_max=LIDAR.range_max)
+GRID = LikelihoodGridConfig(resolution=0.25, headings=16, angles_per_heading=2, beams=32, model=MODEL)
+NETWORK = DSOMConfig(width=2, headings=8, channels=2, resolution=0.25, range_max=8.0, reach_min=1.0, fov_min=0.1)
+prepare = jax.jit(lambda proposal, inputs: proposal.prepare(inputs))
+
+
+@pytest.fixture(scope="module")
+def parts():
+    # Sharpened: a network that was never trained says nearly the same of all places.
+    model = create(NETWORK, seed=3)
+    model.decoder.head.kernel[...] = model.decoder.head.kernel[...] * 300
+    grid = tiny_world.grid()
+    return likelihood_grid(grid, LIDAR, GRID), dsom(evaluation_view(model), grid, LIDAR)
+
+
+@pytest.fixture(scope="module")
+def scan():
+    episode = tiny_world.drive()
+    return Inputs(episode.ranges[3], jnp.zeros(3), jnp.int32(0))
+
+
+def shares(pm):
+    return np.asarray(pm.mass) / float(pm.mass.sum())
+
+
+def test_without_weight_the_network_says_nothing(parts, scan):
+    pm = prepare(Hybrid(*parts, HybridConfig(network=0.0)), scan)
+    np.testing.assert_allclose(shares(pm), shares(prepare(parts[0], scan)), atol=1e-6)
+
+
+def test_without_evidence_pm_is_the_networks_with_a_floor(parts, scan):
+    floor = 0.1
+    pm = prepare(Hybrid(*parts, HybridConfig(evidence=0.0, floor=floor)), scan)
+    own = shares(prepare(parts[1], scan))
+    grid = parts[0].pose_grid
+    i, j = np.nonzero(np.asarray(parts[0].free))
+    even = floor / (int(parts[1].free.sum()) * NETWORK.headings)
+    expected = (1 - floor) * own + even
+    got = shares(pm)
+    for a, b in list(zip(i, j, strict=True))[::37]:
+        for k in range(0, GRID.headings, 2):  # every second heading of the finer grid is one of the network's
+            place = pg.pose_cell(parts[1].pose_grid, pg.cell_pose(grid, jnp.int32(a), jnp.int32(b), jnp.int32(k)))
+            ci, cj, ck = (round(float(v)) for v in place)
+            ratio = got[a, b, k] / expected[ci, cj, ck % NETWORK.headings]
+            np.testing.assert_allclose(ratio, got[i[0], j[0], 0] / value(expected, parts, i[0], j[0]), rtol=2e-3)
+
+
+def value(expected, parts, i, j):
+    place = pg.pose_cell(parts[1].pose_grid, pg.cell_pose(parts[0].pose_grid, *map(jnp.int32, (i, j, 0))))
+    ci, cj, ck = (round(float(v)) for v in place)
+    return expected[ci, cj, ck % NETWORK.headings]
+
+
+def test_headings_are_interpolated_in_between():
+    grid = pg.PoseGrid(jnp.zeros(3), 2, 3, 4, 1.0)
+    layers = jnp.arange(4.0)[:, None] * jnp.ones((4, 6))
+    poses = jnp.asarray([[0.5, 0.5, -math.pi + share * math.pi / 2] for share in (0.0, 0.25, 2.5, 3.5)])
+    # Between the last heading and the first one lies the mean of 3 and 0.
+    np.testing.assert_allclose(interpolate_headings(layers, grid, poses), [0.0, 0.25, 2.5, 1.5], atol=1e-5)
+
+
+def test_a_mounted_lidar_still_gives_poses_of_the_base(parts):
+    lidar = replace(LIDAR, mount=(0.4, -0.2, 0.0))
+    grid, base = tiny_world.grid(), tiny_world.drive().poses[3]
+    ranges = tiny_world.cast(tiny_world.tables(), base, lidar)
+    mounted = Hybrid(likelihood_grid(grid, lidar, GRID), replace(parts[1], lidar=lidar), HybridConfig(network=0.1))
+    pm = prepare(mounted, Inputs(ranges, jnp.zeros(3), jnp.int32(0)))
+    poses, log_density = mounted.sample(jax.random.key(0), pm, 500)
+    near = np.hypot(*(np.asarray(poses) - np.asarray(base))[:, :2].T) < 0.5
+    assert near.mean() > 0.5 and jnp.isfinite(log_density).all()
+    sensor = compose(poses, jnp.asarray([0.4, -0.2, 0.0]))
+    assert np.asarray(is_free(grid, sensor)).mean() > 0.9
+
+
+@pytest.mark.parametrize("change", [{"evidence": -1.0}, {"network": -0.1}, {"floor": 0.0}, {"floor": 1.0}])
+def test_weights_that_mean_nothing_are_refused(change):
+    with pytest.raises(ValueError, match="HybridConfig"):
+        HybridConfig(**change)
