@@ -34,6 +34,7 @@ from dsom_jax.training.loop import (
 )
 from dsom_jax.training.memory import keep_freed_memory
 from dsom_jax.training.options import override
+from dsom_jax.training.sharding import data_mesh, replicate, spread
 
 CALIBRATION_STEPS = 30
 
@@ -223,10 +224,12 @@ class Trainer:
     def __init__(self, args: Arguments, run: Run) -> None:
         self.args, self.run = args, run
         grids = load_maps(tuple(Path(m) for m in run.maps), run.config.model.resolution) if run.maps else []
-        self.batches = make_batches(run.config, grids)
+        self.mesh = data_mesh()
+        make = make_batches(run.config, grids)
+        self.batches = lambda step, total: spread(make(step, total), self.mesh)
         self.step = make_step(run.config)
         self.evaluate = held_out(run, grids)
-        self.state = first_state(args, run)
+        self.state = replicate(first_state(args, run), self.mesh)
         self.saved_at = time.monotonic()
         self.clock = time.monotonic()
         trim_log(run.out / "metrics.jsonl", int(self.state.step))
