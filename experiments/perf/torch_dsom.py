@@ -6,6 +6,8 @@ truth) is given, as it is to the step in JAX but for the views, which JAX casts 
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import torch
 import torch.nn.functional as F
 from torch import nn
@@ -21,7 +23,7 @@ def block(inputs: int, outputs: int) -> nn.Sequential:
 def stack(inputs: int, outputs: list[int]) -> nn.Sequential:
     """Blocks one after the other."""
     sizes = [inputs, *outputs]
-    return nn.Sequential(*(block(i, o) for i, o in zip(sizes, sizes[1:], strict=False)))
+    return nn.Sequential(*(block(i, o) for i, o in pairwise(sizes)))
 
 
 def circular(inputs: int, outputs: int) -> nn.Sequential:
@@ -44,7 +46,12 @@ class TorchDSOM(nn.Module):
         self.scan = nn.ModuleList([circular(i, o) for i, o in sizes])
         self.project_scan = nn.Conv1d(4 * w, c, 1)
         self.stages = nn.ModuleList(
-            [stack(2 * k, [4 * w]), stack(4 * w, [4 * w] * 3 + [2 * w]), stack(2 * w + k, [2 * w] * 2 + [w]), stack(w, [w])]
+            [
+                stack(2 * k, [4 * w]),
+                stack(4 * w, [4 * w] * 3 + [2 * w]),
+                stack(2 * w + k, [2 * w] * 2 + [w]),
+                stack(w, [w]),
+            ]
         )
         self.head = nn.Conv2d(w, k, 3, padding=1)
         self.sharpness = nn.Parameter(torch.tensor([2.3, 3.4]))

@@ -94,7 +94,10 @@ def main(width: int = 32, repeats: int = 9) -> None:
     step, work = training(config, batch)
     calls = {"batch": lambda: batches(0, 1000), "step": step, "inference": inference(config, occupied, ranges)}
     if find_spec("torch"):
-        calls |= {"torch_step": torch_training(config, batch), "torch_inference": torch_inference(config, occupied, ranges)}
+        calls |= {
+            "torch_step": torch_training(config, batch),
+            "torch_inference": torch_inference(config, occupied, ranges),
+        }
     results = {name: measure(call, repeats) for name, call in calls.items()}
     samples = config.early.worlds * config.early.scans
     for name, times in results.items():

@@ -62,6 +62,7 @@ class Settings:
         seed: of what is random while a filter is built (the samples of Mixture MCL).
         motion, score, raycast: drive, Eq 15 and expected ranges of the paper's filters.
         grid: the likelihood grid.
+        sharpness: exponent of DSOM's PM (``experiments/dsom``).
         hybrid: weights of likelihood grid and network.
         robust, robust_motion, robust_raycast: AdaM robust; its ``particles`` are those above.
     """
@@ -74,6 +75,7 @@ class Settings:
     score: ScoreModel = ScoreModel()
     raycast: RaycastConfig = RaycastConfig("table")
     grid: LikelihoodGridConfig = LikelihoodGridConfig()
+    sharpness: float = 1.0
     hybrid: HybridConfig = HybridConfig()
     robust: RobustConfig = RobustConfig(model=BeamModel(0.65, 0.05, 0.05, 0.25, sigma_hit=0.1, temper=0.2))
     robust_motion: Motion = OdometryMotion(0.01, 0.01, 0.01, 0.01, 0.02, 0.015, slip=0.1, tail=0.4, tail_scale=4.0)
@@ -144,11 +146,12 @@ def make_proposal(
         model = replace(settings.grid.model, range_max=lidar.range_max)
         return likelihood_grid(grid, lidar, replace(settings.grid, model=model))
     if name == "dsom":
-        return dsom(checkpoint, grid, lidar)
+        return dsom(checkpoint, grid, lidar, settings.sharpness)
     if name == "hybrid":
         have = made or {}
-        parts: Any = [have.get(p) or make_proposal(p, grid, lidar, settings, checkpoint) for p in PARTS[name]]
-        return Hybrid(*parts, settings.hybrid)
+        parts = (have.get(p) or make_proposal(p, grid, lidar, settings, checkpoint) for p in PARTS[name])
+        likelihood, network = parts
+        return Hybrid(likelihood, network, settings.hybrid)  # type: ignore[arg-type]  # as their names say
     if name == "dual_features":
         return dual_features(jax.random.key(settings.seed), grid, lidar, DualFeaturesConfig())
     raise ValueError(f"make_proposal: no proposal is called {name!r}")

@@ -22,7 +22,7 @@ class DSOMConfig:
         scan_size: cells along a side of the scan image of the ``paper`` encoder, 64 or 128.
         range_max: metres; longer ranges count as no return.
         channels: features of one heading bin of the ``polar`` encoder, so that D = K * channels.
-        panorama: compare ``polar`` scans also with what would be seen from every second cell of the map, by ray casting.
+        panorama: compare ``polar`` scans also with views that are ray-cast from every second cell of the map.
         radial_bins: radial basis functions that describe one range to the ``polar`` encoder.
         fov_min: the narrowest scan it was trained for, radians.
         reach_min: the shortest maximal range it was trained for, metres.

@@ -61,7 +61,8 @@ class Decoder(nnx.Module):
         ``indices`` are the environment encoder's, (N, ., ., C): all scans of a map share them.
         """
         n, s = similarity.coarse.shape[:2]
-        coarse, fine = (None if part is None else part.reshape(n * s, *part.shape[2:]) for part in similarity)
+        coarse = similarity.coarse.reshape(n * s, *similarity.coarse.shape[2:])
+        fine = None if similarity.fine is None else similarity.fine.reshape(n * s, *similarity.fine.shape[2:])
         x = self.stages[0](coarse if fine is None else jnp.concatenate([coarse, block_max(fine, 4)], axis=-1))
         for level, index in enumerate(reversed(indices)):
             x = max_unpool(x.reshape(n, s, *x.shape[1:]), jnp.broadcast_to(index[:, None], (n, s, *index.shape[1:])))

@@ -24,7 +24,7 @@ def radial_basis(reach: Array, config: DSOMConfig) -> Array:
 
 
 def range_features(distance: Array, returned: Array, config: DSOMConfig) -> Array:
-    """What is said of one ray: no return, range / range_max, radial basis; (..., 2 + R) of distances (...) in metres."""
+    """No return, range / range_max and radial basis (..., 2 + R) of rays with distances (...) in metres."""
     basis = jnp.where(returned[..., None], radial_basis(distance, config), 0.0)
     return jnp.concatenate([~returned[..., None], distance[..., None] / config.range_max, basis], axis=-1)
 

@@ -27,6 +27,7 @@ class DSOMProposal:
         pose_grid: (H, W, K) cells of PM.
         graph: structure of the network (static).
         lidar: geometry of the whole scan (static).
+        sharpness: exponent of PM before it is normalised again (static).
     """
 
     weights: Any
@@ -34,6 +35,7 @@ class DSOMProposal:
     pose_grid: pg.PoseGrid
     graph: Any = field(metadata={"static": True})
     lidar: LidarConfig = field(metadata={"static": True})
+    sharpness: float = field(default=1.0, metadata={"static": True})
 
     @property
     def free(self) -> Array:
@@ -43,20 +45,20 @@ class DSOMProposal:
     def prepare(self, inputs: Inputs) -> pg.ProbabilityMap:
         """One pass of the scan encoder and the decoder."""
         log_pm = log_probability_map(nnx.merge(self.graph, self.weights), self.features, inputs.ranges, self.lidar)
-        return pg.from_log(self.pose_grid, log_pm, self.features.free)
+        return pg.from_log(self.pose_grid, self.sharpness * log_pm, self.features.free)
 
     def sample(self, key: Key, prepared: pg.ProbabilityMap, n: int) -> tuple[Array, Array]:
         """``n`` poses (n, 3) from PM and their log densities."""
         return pg.sample(key, prepared, n)
 
 
-def dsom(model: DSOM, grid: OccupancyGrid, lidar: LidarConfig) -> DSOMProposal:
-    """Proposal of an evaluation view of a network, on a map resampled to the network's scale."""
+def dsom(model: DSOM, grid: OccupancyGrid, lidar: LidarConfig, sharpness: float = 1.0) -> DSOMProposal:
+    """Proposal of an evaluation view of a network, on a map resampled to its scale; ``sharpness`` is an exponent."""
     scaled = grid if abs(grid.resolution - model.config.resolution) < 1e-4 else resample(grid, model.config.resolution)
     graph, weights = nnx.split(model)
     weights = nnx.as_pure(weights)
     features = _features(graph, weights, scaled)
-    return DSOMProposal(weights, features, pg.over(scaled, model.config.headings), graph, lidar)
+    return DSOMProposal(weights, features, pg.over(scaled, model.config.headings), graph, lidar, sharpness)
 
 
 @partial(jax.jit, static_argnames="graph")

@@ -47,8 +47,8 @@ class ScanConfig:
         dropout: largest probability of a beam without return.
         short: largest probability of a beam cut short by something unknown.
         obstacles: least and largest number of unknown obstacles per 43 m x 43 m.
-        depth: least and largest distance behind the mapped edge of a wall at which the beams of a scan end, metres: coarse
-            cells of real maps begin before their walls.
+        depth: least and largest distance behind the mapped edge of a wall at which the beams of a scan end, metres;
+            coarse cells of real maps begin before their walls.
         deep: probability that a scan has such a depth.
         bare: probability that the map of a procedural building shows its walls only, as floor plans do.
     """
@@ -71,7 +71,6 @@ class ScanConfig:
     def lidar(self) -> LidarConfig:
         """The lidar that is cast, a full turn."""
         return LidarConfig(self.beams, -math.pi, 2 * math.pi / self.beams, 0.0, self.range_max)
-
 
 
 def plain(config: ScanConfig) -> ScanConfig:

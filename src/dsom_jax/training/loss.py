@@ -50,7 +50,9 @@ def dsom_losses(outputs: Outputs, target: Target, free: Array, similarity_weight
     """Losses of a batch: outputs for N maps x S scans, target factors (N, S, .), free (N, H, W)."""
     free = free[:, None]
     main = kld(outputs.logits, dense(target, free), free).mean()
-    side = sum(similarity_loss(part, target, free) for part in outputs.similarity if part is not None)
+    side = similarity_loss(outputs.similarity.coarse, target, free)
+    if outputs.similarity.fine is not None:
+        side += similarity_loss(outputs.similarity.fine, target, free)
     return Losses(main + similarity_weight * side, main, side)
 
 

@@ -44,9 +44,7 @@ def heading_weights(theta: Array, headings: int) -> Array:
     return jnp.maximum(0.0, 1.0 - distance)
 
 
-def make_target(
-    poses: Array, shape: tuple[int, int], headings: int, resolution: float, sigma: float = SIGMA
-) -> Target:
+def make_target(poses: Array, shape: tuple[int, int], headings: int, resolution: float, sigma: float = SIGMA) -> Target:
     """Factors of GT for poses (..., 3) in the grid's own frame (metres from its lower-left corner, radians).
 
     ``sigma`` is the blur in cells; the paper's is 3.
