@@ -17,7 +17,7 @@ LAYERS = (
     ("motion", "sensor", "nn", "simulate"),
     ("proposals", "metrics"),
     ("filters", "training", "montecarlo"),
-    ("data", "checkpoint", "plotting", "report"),
+    ("data", "checkpoint", "run_folder", "plotting", "report"),
     ("cli", "train", "bench", "localize", "evaluate"),
 )
 DEVICE = 5

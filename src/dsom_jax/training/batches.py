@@ -74,7 +74,7 @@ class ScanConfig:
 
 
 def plain(config: ScanConfig) -> ScanConfig:
-    """Full scans of the lidar of ``config`` with little noise, the map complete but for 20 obstacles per 43 m x 43 m."""
+    """Full scans with little noise; the map lacks only 20 obstacles per 43 m x 43 m."""
     quiet = replace(config, sigma=0.02, dropout=0.0, short=0.0, deep=0.0)
     return replace(quiet, limited=0.0, thinning=1, obstacles=(20, 20), bare=0.0)
 

@@ -1,0 +1,25 @@
+"""What all figures share: panels, a legend, and writing to a file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write PNG at 150 dpi or PDF, as the ending of ``path`` says, whole or not at all."""
+    draft = path.with_name(f".{path.name}")
+    figure.savefig(draft, format=path.suffix[1:], dpi=150, bbox_inches="tight")
+    draft.replace(path)
+
+
+def panels(count: int, width: float, height: float, sharey: bool = False) -> tuple[Figure, list[Axes]]:
+    figure = Figure(figsize=(width * count, height), layout="constrained")
+    return figure, list(figure.subplots(1, count, squeeze=False, sharey=sharey)[0])
+
+
+def legend(figure: Figure, handles: Any, labels: Any, columns: int, title: str | None = None) -> None:
+    figure.legend(handles, labels, loc="outside lower center", ncols=columns, title=title, frameon=False, fontsize=8)
