@@ -8,34 +8,20 @@ from typing import Any
 import jax
 
 from dsom_jax.filters.common import Info, ParticleState
-from dsom_jax.filters.updates import FilterConfig, World, mixture_update, start
-from dsom_jax.types import Array, Inputs, Key, Proposal
+from dsom_jax.filters.updates import SharedProposal, mixture_update
+from dsom_jax.types import Array, Inputs, Key
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class AdamMCL:
+class AdamMCL(SharedProposal):
     """Each particle keeps its history or is redrawn, as its own weight says.
 
     Attributes:
-        world: map and models.
-        proposal: samplable observation model, DSOM in the paper.
-        config: particles, predecessor rule, resampling (static).
         t_cut: trust above which a particle is always kept (static).
     """
 
-    world: World
-    proposal: Proposal
-    config: FilterConfig = field(metadata={"static": True})
     t_cut: float = field(default=0.6, metadata={"static": True})
-
-    def prepare(self, inputs: Inputs) -> Any:
-        """The proposal for this scan."""
-        return self.proposal.prepare(inputs)
-
-    def init(self, key: Key) -> ParticleState:
-        """Uniform particles."""
-        return start(key, self.world, self.config)
 
     def step(self, key: Key, state: ParticleState, inputs: Inputs, prepared: Any) -> tuple[ParticleState, Info]:
         """One update; all of the first is MCL."""

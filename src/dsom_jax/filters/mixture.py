@@ -9,34 +9,20 @@ import jax
 import jax.numpy as jnp
 
 from dsom_jax.filters.common import Info, ParticleState
-from dsom_jax.filters.updates import FilterConfig, World, mixture_update, start
-from dsom_jax.types import Inputs, Key, Proposal
+from dsom_jax.filters.updates import SharedProposal, mixture_update
+from dsom_jax.types import Inputs, Key
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class MixtureMCL:
+class MixtureMCL(SharedProposal):
     """The coin is tossed once per update for the whole set; the first update is always MCL.
 
     Attributes:
-        world: map and models.
-        proposal: samplable observation model of the dual update.
-        config: particles, predecessor rule, resampling (static).
         p: probability of an MCL update, 0.95 in the authors' code (static).
     """
 
-    world: World
-    proposal: Proposal
-    config: FilterConfig = field(metadata={"static": True})
     p: float = field(default=0.95, metadata={"static": True})
-
-    def prepare(self, inputs: Inputs) -> Any:
-        """The proposal for this scan."""
-        return self.proposal.prepare(inputs)
-
-    def init(self, key: Key) -> ParticleState:
-        """Uniform particles."""
-        return start(key, self.world, self.config)
 
     def step(self, key: Key, state: ParticleState, inputs: Inputs, prepared: Any) -> tuple[ParticleState, Info]:
         """One update."""

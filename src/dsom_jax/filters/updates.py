@@ -187,3 +187,26 @@ def mixture_update(
     trusted = mcl_update(k_high, state, high, inputs, world, config)
     redrawn = dual_update(k_low, state, inputs, world, proposal, prepared, config)
     return mix(state, high, trusted, redrawn, redrawn.poses)
+
+
+@dataclass(frozen=True)
+class SharedProposal:
+    """What the filters that mix MCL and dual MCL have in common.
+
+    Attributes:
+        world: map and models.
+        proposal: samplable observation model of the dual update; DSOM in the paper.
+        config: particles, predecessor rule, resampling (static).
+    """
+
+    world: World
+    proposal: Proposal
+    config: FilterConfig = field(metadata={"static": True})
+
+    def prepare(self, inputs: Inputs) -> Any:
+        """The proposal for this scan."""
+        return self.proposal.prepare(inputs)
+
+    def init(self, key: Key) -> ParticleState:
+        """Uniform particles."""
+        return start(key, self.world, self.config)
