@@ -159,7 +159,8 @@ def test_command_line(suite, monkeypatch, tmp_path, capsys):
 
 def test_default_methods_are_those_that_can_be_run(tmp_path):
     assert "adam_dsom" not in bench.chosen_methods("", None) and "mcl" in bench.chosen_methods("", None)
-    assert bench.chosen_methods("", tmp_path) == bench.METHODS
+    assert bench.chosen_methods("", tmp_path) == bench.STANDARD and len(bench.STANDARD) == 8
+    assert bench.chosen_methods("robust_hybrid", tmp_path) == ("robust_hybrid",)
     assert bench.chosen_methods("mcl,mcl", None) == ("mcl",)
 
 
@@ -173,6 +174,7 @@ def test_default_methods_are_those_that_can_be_run(tmp_path):
         (("--seed", "-1"), "--seed"),
         (("--methods", "mcl,magic"), "magic"),
         (("--methods", "adam_dsom"), "--checkpoint"),
+        (("--methods", "robust_hybrid"), "--checkpoint"),
         (("--suite", "nowhere"), "nowhere"),
         (("--out", "FILE"), "--out"),
         (("--checkpoint", "FILE"), "FILE"),

@@ -1,7 +1,7 @@
 """Killed twenty times, training ends with the numbers of a run left alone: ``python experiments/dsom/kills.py``.
 
-A tiny network on procedural buildings, saved every second step. Every start is killed with SIGKILL at a random time
-after its first step; then losses and weights are compared bit for bit. Writes ``results/kills.json``.
+A tiny network on procedural buildings, saved every second step. Every start is killed with SIGKILL within five seconds
+of its first step; then losses and weights are compared bit for bit. Writes ``results/kills.json``.
 """
 
 from __future__ import annotations
@@ -44,9 +44,10 @@ def start(folder: Path, out: str, steps: int) -> subprocess.Popen[bytes]:
 
 
 def kill_soon(process: subprocess.Popen[bytes], log: Path, delay: float) -> bool:
-    """SIGKILL ``delay`` seconds after the log first grew; whether it was still running then."""
-    size = log.stat().st_size if log.exists() else 0
-    while process.poll() is None and not (log.exists() and log.stat().st_size != size):
+    """SIGKILL ``delay`` seconds after its first step; whether it was still running then."""
+    least = log.stat().st_size if log.exists() else 0
+    while process.poll() is None and (not log.exists() or log.stat().st_size <= least):
+        least = min(least, log.stat().st_size if log.exists() else 0)  # a resumed run first trims the log
         time.sleep(0.002)
     time.sleep(delay)
     running = process.poll() is None
@@ -66,7 +67,7 @@ def weights(folder: Path) -> bytes:
     return b"".join(np.asarray(x).tobytes() for x in jax.tree.leaves(checkpoint.load(folder)))
 
 
-def main(kills: int = 20, steps: int = 60, seed: int = 0) -> None:
+def main(kills: int = 20, steps: int = 150, seed: int = 0) -> None:
     """Run, compare, save."""
     luck, done = random.Random(seed), 0
     with tempfile.TemporaryDirectory() as name:
@@ -75,7 +76,7 @@ def main(kills: int = 20, steps: int = 60, seed: int = 0) -> None:
         if start(folder, "whole", steps).wait():
             raise SystemExit("the run that is left alone failed")
         while done < kills:
-            done += kill_soon(start(folder, "killed", steps), folder / "killed" / "metrics.jsonl", luck.uniform(0, 0.6))
+            done += kill_soon(start(folder, "killed", steps), folder / "killed" / "metrics.jsonl", luck.uniform(0, 5.0))
             left = steps - len(numbers(folder / "killed"))
             print(f"killed {done} times, {left} steps left", flush=True)
             if left <= 2:

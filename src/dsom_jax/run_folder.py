@@ -22,10 +22,12 @@ class Run:
     maps: tuple[str, ...]
     total: int | None
     seconds: float = 0.0
+    init: str | None = None
 
     def record(self) -> dict[str, Any]:
         """What run.json holds."""
-        return {"config": asdict(self.config), "maps": list(self.maps), "total": self.total, "seconds": self.seconds}
+        facts = {"maps": list(self.maps), "init": self.init, "total": self.total, "seconds": self.seconds}
+        return {"config": asdict(self.config), **facts}
 
     def write(self) -> None:
         """Write run.json."""
@@ -48,7 +50,14 @@ class Run:
     def provenance(self, step: int, metrics: dict[str, Any]) -> dict[str, Any]:
         """How the weights came about."""
         data = [Path(path).name for path in self.maps] or "procedural buildings, dsom_jax.simulate.make_world"
-        facts = {"seed": self.config.seed, "commit": commit(), "data": data, "steps": step, "total": self.total}
+        facts = {
+            "seed": self.config.seed,
+            "commit": commit(),
+            "data": data,
+            "init": self.init,
+            "steps": step,
+            "total": self.total,
+        }
         effort = {"seconds": round(self.seconds, 1), "samples": self.samples(step)}
         return {**facts, **effort, "metrics": metrics, "train": asdict(self.config)}
 

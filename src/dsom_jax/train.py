@@ -99,7 +99,8 @@ def open_run(args: Arguments) -> Run:
         return resume_run(args, path)
     if not args.resume and args.out.exists() and any(args.out.iterdir()):
         raise UserError(f"{args.out}: not empty; add --resume to continue that run, or give another --out")
-    run = Run(args.out, read_config(args.config), tuple(str(p) for p in args.maps), args.steps)
+    begin = None if args.init is None else args.init.name
+    run = Run(args.out, read_config(args.config), tuple(str(p) for p in args.maps), args.steps, init=begin)
     # Read once before anything is written: a bad map or checkpoint leaves no folder behind.
     load_maps(args.maps, run.config.model.resolution)
     load_init(args.init, run.config)
@@ -116,7 +117,7 @@ def resume_run(args: Arguments, path: Path) -> Run:
     try:
         record = json.loads(path.read_text())
         config = override(TrainConfig(), record["config"], str(path))
-        run = Run(args.out, config, tuple(record["maps"]), record["total"], record["seconds"])
+        run = Run(args.out, config, tuple(record["maps"]), record["total"], record["seconds"], record.get("init"))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(f"{path}: no run to resume here ({error}); start without --resume") from error
     if args.config is not None and read_config(args.config) != config:
