@@ -144,7 +144,6 @@ def test_localize_with_spoilt_files(good, refused, tmp_path, kind):
         (("--reference", "early.tum"), ["early.tum", "same clock"]),
         (("--log", "drive.txt"), ["drive.txt", "'.txt'", "CARMEN"]),
         (("--log", "drive.bag"), ["drive.bag"]),
-        (("--proposal", "dsom"), ["--checkpoint"]),
         (("--proposal", "dsom", "--checkpoint", "nowhere"), ["nowhere/provenance.json", "dsom_jax.train"]),
         (("--proposal", "dsom", "--checkpoint", "broken"), ["broken/provenance.json", "not JSON"]),
         (("--proposal", "dsom", "--checkpoint", "empty"), ["empty/provenance.json", "format"]),
@@ -163,6 +162,12 @@ def test_localize_with_wrong_words(good, refused, tmp_path, words, fragments):
         (tmp_path / name / "provenance.json").write_text(text)
     error = refused(localize.main, *LOCALIZE, *words)
     assert all(fragment in error for fragment in fragments), error
+
+
+@pytest.mark.parametrize("proposal", ["dsom", "hybrid"])
+def test_a_network_is_needed_where_none_is_shipped(good, refused, monkeypatch, proposal):
+    monkeypatch.setattr(checkpoint, "shipped", lambda: None)
+    assert "--checkpoint" in refused(localize.main, *LOCALIZE, "--proposal", proposal)
 
 
 def test_a_checkpoint_whose_weights_are_of_another_configuration(good, refused, tmp_path):

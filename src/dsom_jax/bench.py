@@ -38,7 +38,8 @@ class Args:
     suite: str = "synthetic-v1"
     """Name of a suite, or a TOML file that describes one."""
     methods: str = ""
-    """Comma-separated method names; default: all, or all that need no network where none is shipped."""
+    """Comma-separated method names; default: the eight of the standard comparison (not the hybrids), without
+    those that need a network where none is shipped."""
     particles: int = 200
     """Particles per run."""
     t_cut: float = 0.6

@@ -43,7 +43,7 @@ class Args:
     proposal: Literal["likelihood_grid", "dsom", "hybrid", "uniform", "dual_features"] = "likelihood_grid"
     """Where redrawn particles come from; `mcl` always draws uniformly."""
     checkpoint: Path | None = None
-    """Folder of a trained network, for dsom."""
+    """Folder of a trained network, for dsom and hybrid; default: the one in the repository."""
     map_kind: Literal["scanned", "drawn"] = "scanned"
     """A map made from scans, or a floor plan that shows walls only."""
     particles: int = 500
@@ -117,7 +117,7 @@ def check(args: Args) -> None:
         raise UserError(f"--steps-per-segment {args.steps_per_segment}: give at least 6, or 0 for the whole log")
     if not 0 < args.t_cut < 1:
         raise UserError(f"--t-cut {args.t_cut}: give a number between 0 and 1 (the paper uses 0.6)")
-    if args.proposal in ("dsom", "hybrid") and args.method != "mcl" and args.checkpoint is None:
+    if needs_network(args) and network_folder(args) is None:
         raise UserError(f"--proposal {args.proposal}: give --checkpoint, the folder of a trained network")
     if args.kidnap and args.segments < 2:
         raise UserError(f"--segments {args.segments}: --kidnap joins two segments, give at least 2")
@@ -154,11 +154,20 @@ def cut(log: RawLog, args: Args) -> list[Drive]:
     ]
 
 
+def needs_network(args: Args) -> bool:
+    """Whether the filter draws from a trained network."""
+    return args.proposal in ("dsom", "hybrid") and args.method != "mcl"
+
+
+def network_folder(args: Args) -> Path | None:
+    """The checkpoint that is named, else the one that comes with the repository."""
+    return args.checkpoint or checkpoint.shipped()
+
+
 def load_network(args: Args, lidar: LidarConfig) -> Any:
-    """The trained network that the arguments name, None without."""
-    if args.checkpoint is None or args.method == "mcl":
-        return None
-    return checkpoint.load(args.checkpoint, lidar=lidar)
+    """The trained network that the arguments ask for, None without."""
+    folder = network_folder(args) if needs_network(args) or args.checkpoint else None
+    return None if folder is None or args.method == "mcl" else checkpoint.load(folder, lidar=lidar)
 
 
 def build(args: Args, grid: OccupancyGrid, lidar: LidarConfig, network: Any = None) -> Filter:
