@@ -48,7 +48,7 @@ def shares(pm):
 
 
 def test_without_weight_the_network_says_nothing(parts, scan):
-    pm = prepare(Hybrid(*parts, HybridConfig(network=0.0)), scan)
+    pm = prepare(Hybrid(*parts, HybridConfig(evidence=1.0, network=0.0)), scan)
     np.testing.assert_allclose(shares(pm), shares(prepare(parts[0], scan)), atol=1e-6)
 
 
@@ -87,7 +87,9 @@ def test_a_mounted_lidar_still_gives_poses_of_the_base(parts):
     lidar = replace(LIDAR, mount=(0.4, -0.2, 0.0))
     grid, base = tiny_world.grid(), tiny_world.drive().poses[3]
     ranges = tiny_world.cast(tiny_world.tables(), base, lidar)
-    mounted = Hybrid(likelihood_grid(grid, lidar, GRID), replace(parts[1], lidar=lidar), HybridConfig(network=0.1))
+    mounted = Hybrid(
+        likelihood_grid(grid, lidar, GRID), replace(parts[1], lidar=lidar), HybridConfig(evidence=1.0, network=0.1)
+    )
     pm = prepare(mounted, Inputs(ranges, jnp.zeros(3), jnp.int32(0)))
     poses, log_density = mounted.sample(jax.random.key(0), pm, 500)
     near = np.hypot(*(np.asarray(poses) - np.asarray(base))[:, :2].T) < 0.5

@@ -75,7 +75,7 @@ class Settings:
     score: ScoreModel = ScoreModel()
     raycast: RaycastConfig = RaycastConfig("table")
     grid: LikelihoodGridConfig = LikelihoodGridConfig()
-    sharpness: float = 1.0
+    sharpness: float = 2.0
     hybrid: HybridConfig = HybridConfig()
     robust: RobustConfig = RobustConfig(model=BeamModel(0.65, 0.05, 0.05, 0.25, sigma_hit=0.1, temper=0.2))
     robust_motion: Motion = OdometryMotion(0.01, 0.01, 0.01, 0.01, 0.02, 0.015, slip=0.1, tail=0.4, tail_scale=4.0)

@@ -42,10 +42,13 @@ class DSOMProposal:
         """(H, W) bool, cells of PM with free space."""
         return self.features.free
 
+    def log_map(self, inputs: Inputs) -> Array:
+        """Log PM (H, W, K) of one scan as the network gives it: a pass of the scan encoder and the decoder."""
+        return log_probability_map(nnx.merge(self.graph, self.weights), self.features, inputs.ranges, self.lidar)
+
     def prepare(self, inputs: Inputs) -> pg.ProbabilityMap:
-        """One pass of the scan encoder and the decoder."""
-        log_pm = log_probability_map(nnx.merge(self.graph, self.weights), self.features, inputs.ranges, self.lidar)
-        return pg.from_log(self.pose_grid, self.sharpness * log_pm, self.features.free)
+        """PM of one scan, sharpened."""
+        return pg.from_log(self.pose_grid, self.sharpness * self.log_map(inputs), self.features.free)
 
     def sample(self, key: Key, prepared: pg.ProbabilityMap, n: int) -> tuple[Array, Array]:
         """``n`` poses (n, 3) from PM and their log densities."""

@@ -24,8 +24,8 @@ class HybridConfig:
         floor: share of DSOM's probability that is spread evenly, so that it cannot veto a place.
     """
 
-    evidence: float = 1.0
-    network: float = 1.0
+    evidence: float = 0.3
+    network: float = 1.5
     floor: float = 0.01
 
     def __post_init__(self) -> None:
@@ -60,17 +60,17 @@ class Hybrid:
         return self.likelihood.probability_map(evidence + learnt)
 
     def log_network(self, inputs: Inputs) -> Array:
-        """(C, K) log of DSOM's probability, with its floor, at the cells of the likelihood grid."""
-        pm = self.network.prepare(inputs)
-        even = self.config.floor / jnp.maximum(self.network.free.sum() * pm.pose_grid.headings, 1)
-        log_pm = jnp.log((1 - self.config.floor) * pm.mass / pm.cumulative[-1] + even)
-        layers = jnp.moveaxis(log_pm, -1, 0).reshape(pm.pose_grid.headings, -1)
+        """(C, K) log of DSOM's own probability (not sharpened), with its floor, at the cells of the likelihood grid."""
+        network = self.network.pose_grid
+        even = self.config.floor / jnp.maximum(self.network.free.sum() * network.headings, 1)
+        log_pm = jnp.log((1 - self.config.floor) * pg.exp_or_zero(self.network.log_map(inputs)) + even)
+        layers = jnp.moveaxis(log_pm, -1, 0).reshape(network.headings, -1)
         grid, x, y = self.likelihood.pose_grid, *self.likelihood.lidar.mount[:2]
         i, j = jnp.divmod(jnp.minimum(self.likelihood.cells, self.free.size - 1), grid.width)
 
         def one_heading(k: Array) -> Array:
             sensor = pg.cell_pose(grid, i, j, jnp.broadcast_to(k, i.shape))
-            return interpolate_headings(layers, pm.pose_grid, compose(sensor, jnp.array([-x, -y, 0.0])))
+            return interpolate_headings(layers, network, compose(sensor, jnp.array([-x, -y, 0.0])))
 
         return jax.lax.map(one_heading, jnp.arange(grid.headings)).T
 
