@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 def save(figure: Figure, path: Path) -> None:
     """Write PNG at 150 dpi or PDF, as the ending of ``path`` says, whole or not at all."""
     draft = path.with_name(f".{path.name}")
-    figure.savefig(draft, format=path.suffix[1:], dpi=150, bbox_inches="tight")
+    figure.savefig(draft, format=path.suffix[1:], dpi=150)
     draft.replace(path)
 
 
