@@ -137,8 +137,8 @@ def simulate(key: Key, grid: OccupancyGrid, scan: ScanConfig, lidar: LidarConfig
 
 
 def build(name: str, grid: OccupancyGrid, lidar: LidarConfig, network: DSOM) -> Proposal:
-    """Proposal ``name`` as the benchmark uses it."""
-    return make_proposal(name, grid, lidar, Settings(), checkpoint=network)
+    """Proposal ``name`` as the benchmark uses it, but for DSOM's PM, which is not sharpened: the network is judged."""
+    return make_proposal(name, grid, lidar, Settings(sharpness=1.0), checkpoint=network)
 
 
 def judge_all(scenes: Any, lidar: LidarConfig, network: DSOM) -> dict[str, tuple[quality.Quality, float]]:

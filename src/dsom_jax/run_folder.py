@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import subprocess
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,10 @@ from dsom_jax.training.loop import TrainConfig, TrainState, averaged_model, late
 
 @dataclass
 class Run:
-    """A training run and its folder: state-*/ (to resume), metrics.jsonl, run.json, and the checkpoint itself."""
+    """A training run and its folder: state-*/ (to resume), metrics.jsonl, run.json, and the checkpoint itself.
+
+    ``commit`` is that of the code when this process began, whatever happens to the repository while it trains.
+    """
 
     out: Path
     config: TrainConfig
@@ -23,6 +26,7 @@ class Run:
     total: int | None
     seconds: float = 0.0
     init: str | None = None
+    commit: str = field(default_factory=lambda: commit())
 
     def record(self) -> dict[str, Any]:
         """What run.json holds."""
