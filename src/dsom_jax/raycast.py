@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,7 @@ from dsom_jax.occupancy import OccupancyGrid, inside
 from dsom_jax.types import Array
 
 _NUDGE = 1e-3  # cells; larger than float32 rounding at 4,000 cells, smaller than anything a lidar resolves
-_FIRST_STEPS, _MORE_STEPS, _GROUP = 4, 4, 16
+_FIRST_STEPS, _MORE_STEPS, _GROUP = 4, 4, 32
 
 
 @dataclass(frozen=True)
@@ -106,58 +106,102 @@ def cast_rays(tables: MapTables, poses: Array, lidar: LidarConfig) -> Array:
     """
     sensor = tables.grid.to_grid(compose(poses, jnp.asarray(lidar.mount)))
     bearings = jnp.asarray(lidar.angles()) - lidar.mount[2]
-    x, y = (sensor[..., axis, None] / tables.grid.resolution for axis in (0, 1))
+    x, y = (sensor[..., axis] / tables.grid.resolution for axis in (0, 1))
     limit = lidar.range_max / tables.grid.resolution
     if tables.walls is None:
-        reach = march(tables.squares, x, y, *_directions(sensor[..., 2], bearings), limit)
+        reach = march(tables.squares, x, y, sensor[..., 2], bearings, limit)
     else:
-        reach = _meet_walls(tables.walls, x, y, sensor[..., 2], bearings)
+        reach = _meet_walls(tables.walls, x[..., None], y[..., None], sensor[..., 2], bearings)
     reach = reach * tables.grid.resolution + tables.surface
     return jnp.where(reach < lidar.range_max, reach, jnp.inf)
 
 
+class _Fan(NamedTuple):
+    """Rays of P sensors with the same B bearings: everything that a ray is made of, without an array of all rays.
+
+    Attributes:
+        x, y: (P, 1) sensors in cells.
+        cos, sin: (P, 1) of their headings.
+        beam_cos, beam_sin: (B,) of the bearings.
+    """
+
+    x: Array
+    y: Array
+    cos: Array
+    sin: Array
+    beam_cos: Array
+    beam_sin: Array
+
+    def rays(self) -> tuple[Array, Array, Array, Array]:
+        """x, y and direction of all rays, broadcast against (P, B)."""
+        return self.x, self.y, *_turned(self.cos, self.sin, self.beam_cos, self.beam_sin)
+
+    def at(self, ray: Array) -> tuple[Array, Array, Array, Array]:
+        """x, y and direction of the rays with numbers ``ray`` (G,), counted pose by pose."""
+        pose, beam = ray // self.beam_cos.size, ray % self.beam_cos.size
+        x, y, c, s = (_at(v[:, 0], pose) for v in (self.x, self.y, self.cos, self.sin))
+        return x, y, *_turned(c, s, _at(self.beam_cos, beam), _at(self.beam_sin, beam))
+
+
+def _turned(c: Array, s: Array, beam_cos: Array, beam_sin: Array) -> tuple[Array, Array]:
+    """Unit vector of heading + bearing by the addition theorem: no trigonometry per ray."""
+    return c * beam_cos - s * beam_sin, s * beam_cos + c * beam_sin
+
+
 def _directions(theta: Array, bearings: Array) -> tuple[Array, Array]:
-    """Unit vectors of ``theta`` (...) + ``bearings`` (B,), by the addition theorem: no trigonometry per ray."""
+    """Unit vectors of ``theta`` (...) + ``bearings`` (B,)."""
     c, s = jnp.cos(theta)[..., None], jnp.sin(theta)[..., None]
-    cb, sb = jnp.cos(bearings), jnp.sin(bearings)
-    return c * cb - s * sb, s * cb + c * sb
+    return _turned(c, s, jnp.cos(bearings), jnp.sin(bearings))
 
 
-def march(squares: Array, x: Array, y: Array, dx: Array, dy: Array, limit: float) -> Array:
-    """Distance in cells along rays from (x, y) to the first occupied cell; inf from ``limit`` on or off the map.
+def march(squares: Array, x: Array, y: Array, theta: Array, bearings: Array, limit: float) -> Array:
+    """Distance in cells to the first occupied cell; inf from ``limit`` on, and for rays that leave the map.
+
+    Args:
+        squares: of :func:`empty_squares`, with a border of one cell.
+        x, y, theta: (...) sensors, cells from the corner of the map and radians.
+        bearings: (B,) of the rays, radians.
+        limit: cells.
+
+    Returns:
+        (..., B).
 
     Every step leaps out of the largest empty square ahead. All rays take a few steps together; the few that are still
-    under way (grazing a wall) are then taken up one per group of 16, so that they do not hold up the rest.
+    under way (grazing a wall) are then taken up one per group of 32, so that they do not hold up the rest.
     """
-    shape = jnp.broadcast_shapes(x.shape, dx.shape)
-    known = inside((squares.shape[1] - 2, squares.shape[2] - 2), y, x)
-    known &= jnp.isfinite(dx) & jnp.isfinite(dy)
-    rays = [jnp.where(known, v + shift, 0.5).ravel() for v, shift in ((x, 1.0), (y, 1.0))]
-    rays += [jnp.where(known, v, 0.6).ravel() for v in (dx, dy)]
+    shape = (*x.shape, bearings.size)
+    x, y, theta = (v.ravel()[:, None] for v in (x, y, theta))
+    known = inside((squares.shape[1] - 2, squares.shape[2] - 2), y, x) & jnp.isfinite(theta)
+    x, y, theta = jnp.where(known, x, 0.0), jnp.where(known, y, 0.0), jnp.where(known, theta, 0.0)
+    turn = (jnp.cos(theta), jnp.sin(theta), jnp.cos(bearings), jnp.sin(bearings))
+    # Without the barrier every ray computes its heading's sine and cosine again.
+    fan = jax.lax.optimization_barrier(_Fan(x + 1.0, y + 1.0, *turn))
+    reach = _march_fan(squares, fan, limit)
+    hit = known & (reach < limit) & ~_on_border(squares, *fan.rays(), reach)
+    return jnp.where(hit, reach, jnp.inf).reshape(shape)
+
+
+def _march_fan(squares: Array, fan: _Fan, limit: float) -> Array:
+    shape = (fan.x.size, fan.beam_cos.size)
     count = math.prod(shape)
     groups = -(-count // _GROUP)
-    rays = [jnp.pad(v, (0, groups * _GROUP - count), constant_values=0.5) for v in rays]
-    rays = jax.lax.optimization_barrier(rays)
-    reach = _march_flat(squares, rays, limit)[:count].reshape(shape)
-    return jnp.where(known & (reach < limit) & ~_on_border(squares, x, y, dx, dy, reach), reach, jnp.inf)
-
-
-def _march_flat(squares: Array, rays: list[Array], limit: float) -> Array:
-    groups = rays[0].size // _GROUP
-    reach, side = _leap(squares, rays, jnp.zeros_like(rays[0]), _FIRST_STEPS)
+    reach, side = _leap(squares, fan.rays(), jnp.zeros(shape), _FIRST_STEPS)
     rounds = _GROUP * (1 + sum(squares.shape[1:]) // _MORE_STEPS)
+    reach, live = (jnp.pad(v.ravel(), (0, groups * _GROUP - count)) for v in (reach, (side > 0) & (reach < limit)))
 
     def one_per_group(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        reach, live, count = state
+        reach, live, number = state
         order = jnp.arange(_GROUP, dtype=jnp.int32)[:, None]
         first = jnp.where(live.reshape(_GROUP, groups), order, _GROUP - 1).min(0)
         chosen = first * groups + jnp.arange(groups, dtype=jnp.int32)
-        got, side = _leap(squares, [_at(v, chosen) for v in rays], _at(reach, chosen), _MORE_STEPS)
-        live = _put(live, chosen, (side > 0) & (got < limit))
-        return _put(reach, chosen, got), live, count + 1
+        rays = jax.lax.optimization_barrier(fan.at(jnp.minimum(chosen, count - 1)))
+        got, side = _leap(squares, rays, _at(reach, chosen), _MORE_STEPS)
+        live = _put(live, chosen, (side > 0) & (got < limit) & (chosen < count))
+        return _put(reach, chosen, got), live, number + 1
 
-    state = (reach, (side > 0) & (reach < limit), jnp.int32(0))
-    return jax.lax.while_loop(lambda s: s[1].any() & (s[2] < rounds), one_per_group, state)[0]
+    state = (reach, live, jnp.int32(0))
+    reach = jax.lax.while_loop(lambda s: s[1].any() & (s[2] < rounds), one_per_group, state)[0]
+    return reach[:count].reshape(shape)
 
 
 def _at(values: Array, index: Array) -> Array:
@@ -168,7 +212,7 @@ def _put(values: Array, index: Array, new: Array) -> Array:
     return values.at[index].set(new, mode="promise_in_bounds", unique_indices=True)
 
 
-def _leap(squares: Array, rays: list[Array], reach: Array, steps: int) -> tuple[Array, Array]:
+def _leap(squares: Array, rays: tuple[Array, Array, Array, Array], reach: Array, steps: int) -> tuple[Array, Array]:
     """``steps`` leaps of rays that lie inside of the bordered map; ones that arrived stay where they are."""
     x, y, dx, dy = rays
     _, height, width = squares.shape
@@ -183,15 +227,16 @@ def _leap(squares: Array, rays: list[Array], reach: Array, steps: int) -> tuple[
         j, i = jnp.floor(ahead_x + reach * dx), jnp.floor(ahead_y + reach * dy)
         side = _at(flat, layer + (i * width + j).astype(jnp.int32)).astype(jnp.float32)
         leave = jnp.minimum((j + edge_x + side * sign_x) * per_x, (i + edge_y + side * sign_y) * per_y)
-        reach = jnp.maximum(reach, leave)
+        # Without the barrier XLA computes each leap again for every later one.
+        reach, side = jax.lax.optimization_barrier((jnp.maximum(reach, leave), side))
     return reach, side
 
 
 def _on_border(squares: Array, x: Array, y: Array, dx: Array, dy: Array, reach: Array) -> Array:
     """Whether a ray that ended at ``reach`` ended outside of the map (not on an occupied cell)."""
     height, width = squares.shape[1] - 2, squares.shape[2] - 2
-    j = x + reach * dx + jnp.where(dx >= 0, _NUDGE, -_NUDGE)
-    i = y + reach * dy + jnp.where(dy >= 0, _NUDGE, -_NUDGE)
+    j = x - 1 + reach * dx + jnp.where(dx >= 0, _NUDGE, -_NUDGE)
+    i = y - 1 + reach * dy + jnp.where(dy >= 0, _NUDGE, -_NUDGE)
     return ~inside((height, width), i, j) | (i < 0) | (j < 0)
 
 
@@ -206,9 +251,9 @@ def _first_walls(tables: MapTables, angles: int) -> Array:
     limit = tables.range_max / tables.grid.resolution + 1.0
 
     def one_row(i: Array) -> Array:
-        x, y = jnp.arange(width)[:, None] + 0.5, i + 0.5
-        reach = march(tables.squares, x, jnp.full((width, 1), y), dx, dy, limit)
-        at_x, at_y = x + reach * dx, y + reach * dy
+        x, y = jnp.arange(width) + 0.5, i + 0.5
+        reach = march(tables.squares, x, jnp.full(width, y), jnp.zeros(width), theta, limit)
+        at_x, at_y = x[:, None] + reach * dx, y + reach * dy
         across_y = jnp.abs(at_y - jnp.round(at_y)) < jnp.abs(at_x - jnp.round(at_x))
         edge = jnp.round(jnp.where(across_y, at_y, at_x))
         walls = jnp.where(jnp.isfinite(reach), 2 * edge + across_y, -1).astype(jnp.int16)

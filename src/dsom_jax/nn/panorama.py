@@ -34,7 +34,7 @@ def expected_views(occupied: Array, config: DSOMConfig) -> Array:
     bearings = bin_centres(config.angular_bins)
     y, x = jnp.meshgrid(STRIDE * (jnp.arange(h) + 0.5), STRIDE * (jnp.arange(w) + 0.5), indexing="ij")
     limit = config.range_max / config.resolution
-    cells = march(squares, x[..., None], y[..., None], jnp.cos(bearings), jnp.sin(bearings), limit)
+    cells = march(squares, x, y, jnp.zeros_like(x), bearings, limit)
     cells = cells.reshape(h, w, config.headings, -1)
     distance = jnp.minimum(cells * config.resolution, config.range_max)
     return range_features(distance, jnp.isfinite(cells), config).mean(-2)
