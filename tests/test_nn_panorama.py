@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dsom_jax.nn import DSOMConfig
-from dsom_jax.nn.panorama import PanoramaEncoder, expected_views
+from dsom_jax.nn.panorama import PanoramaEncoder, expected_ranges, view_features
 from dsom_jax.nn.polar import bin_centres
 from reference import rays
 
@@ -19,8 +19,12 @@ ROOM[4:7, 9:11] = True
 NO_RETURN, DISTANCE = 0, 1
 
 
+def expected_views(occupied):
+    return np.asarray(view_features(expected_ranges(jnp.asarray(occupied), CONFIG), CONFIG))
+
+
 def test_views_are_means_of_the_slow_casters_ranges():
-    views = np.asarray(expected_views(jnp.asarray(ROOM), CONFIG))
+    views = expected_views(ROOM)
     assert views.shape == (8, 8, 8, 6)
     angles = np.asarray(bin_centres(CONFIG.angular_bins), np.float64)
     for i, j in [(3, 3), (5, 2), (6, 6), (1, 4)]:
@@ -33,9 +37,9 @@ def test_views_are_means_of_the_slow_casters_ranges():
 
 
 def test_turning_the_map_turns_the_views():
-    views = np.asarray(expected_views(jnp.asarray(ROOM), CONFIG))
+    views = expected_views(ROOM)
     # A quarter turn counter-clockwise with rows from the bottom up: (i, j) -> (j, H - 1 - i).
-    turned = np.asarray(expected_views(jnp.asarray(ROOM.T[:, ::-1]), CONFIG))
+    turned = expected_views(ROOM.T[:, ::-1])
     np.testing.assert_allclose(turned, np.roll(views.swapaxes(0, 1)[:, ::-1], 2, axis=2), atol=1e-4)
 
 

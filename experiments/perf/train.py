@@ -19,10 +19,11 @@ import numpy as np
 import tyro
 from timing import machine, measure, save
 
+from dsom_jax import montecarlo
 from dsom_jax.nn import create, encode_map, evaluation_view, log_probability_map
-from dsom_jax.nn.panorama import expected_views
+from dsom_jax.nn.panorama import expected_ranges, view_features
 from dsom_jax.training.batches import Batch
-from dsom_jax.training.loop import TrainConfig, compiler_options, init_state, make_batches, make_step
+from dsom_jax.training.loop import TrainConfig, init_state, make_batches, make_step
 from dsom_jax.training.memory import keep_freed_memory
 from dsom_jax.training.target import dense, make_target, pooled
 
@@ -47,8 +48,13 @@ def inference(config: TrainConfig, occupied: Any, ranges: Any) -> Call:
     """One scan on a map with cached features."""
     model = evaluation_view(create(config.model))
     features = jax.jit(encode_map)(model, occupied)
-    scan = jax.jit(log_probability_map, static_argnums=3, compiler_options=compiler_options())
+    scan = jax.jit(log_probability_map, static_argnums=3, compiler_options=montecarlo._options())
     return lambda: scan(model, features, ranges, config.scan.lidar)
+
+
+def expected_views(config: TrainConfig, occupied: Any) -> np.ndarray:
+    """What the panorama of PyTorch's network is given: views of maps (N, H, W)."""
+    return np.asarray(view_features(jax.vmap(lambda one: expected_ranges(one, config.model))(occupied), config.model))
 
 
 def torch_training(config: TrainConfig, batch: Batch) -> Call:
@@ -57,7 +63,7 @@ def torch_training(config: TrainConfig, batch: Batch) -> Call:
 
     observe = jax.vmap(jax.vmap(lambda r, c: create(config.model).observation(r, config.scan.lidar, c)))
     scans = np.asarray(observe(batch.ranges, batch.conditions)).swapaxes(2, 3).copy()
-    views = np.asarray(jax.vmap(lambda one: expected_views(one, config.model))(batch.occupied))
+    views = expected_views(config, batch.occupied)
     shape = (batch.free.shape[1], batch.free.shape[2])
     target = make_target(batch.poses, shape, config.model.headings, config.model.resolution, config.blur)
     free = batch.free[:, None]
@@ -78,7 +84,7 @@ def torch_inference(config: TrainConfig, occupied: Any, ranges: Any) -> Call:
     import torch_dsom
 
     scan = np.asarray(create(config.model).observation(ranges, config.scan.lidar)).T[None].copy()
-    views = np.asarray(expected_views(occupied, config.model))[None]
+    views = expected_views(config, occupied[None])
     return torch_dsom.make_inference(config.model, np.asarray(occupied, np.float32)[None], views, scan)
 
 

@@ -23,21 +23,19 @@ STRIDE = 2
 _CAP = 31
 
 
-def expected_views(occupied: Array, config: DSOMConfig) -> Array:
-    """What is seen from the centres of the 2 x 2 blocks of ``occupied`` (H, W), averaged over every heading's bearings.
-
-    Returns:
-        (H/2, W/2, K, 2 + R) range features.
-    """
+def expected_ranges(occupied: Array, config: DSOMConfig) -> Array:
+    """Ranges (H/2, W/2, A) in metres from the centres of the 2 x 2 blocks of ``occupied`` (H, W); inf for no return."""
     squares = empty_squares(jnp.pad(occupied.astype(bool), 1, constant_values=True), _CAP)
     h, w = (side // STRIDE for side in occupied.shape)
-    bearings = bin_centres(config.angular_bins)
     y, x = jnp.meshgrid(STRIDE * (jnp.arange(h) + 0.5), STRIDE * (jnp.arange(w) + 0.5), indexing="ij")
     limit = config.range_max / config.resolution
-    cells = march(squares, x, y, jnp.zeros_like(x), bearings, limit)
-    cells = cells.reshape(h, w, config.headings, -1)
-    distance = jnp.minimum(cells * config.resolution, config.range_max)
-    return range_features(distance, jnp.isfinite(cells), config).mean(-2)
+    return config.resolution * march(squares, x, y, jnp.zeros_like(x), bin_centres(config.angular_bins), limit)
+
+
+def view_features(ranges: Array, config: DSOMConfig) -> Array:
+    """Features (..., K, 2 + R) of expected ranges (..., A), averaged over every heading's bearings."""
+    ranges = ranges.reshape(*ranges.shape[:-1], config.headings, -1)
+    return range_features(jnp.minimum(ranges, config.range_max), jnp.isfinite(ranges), config).mean(-2)
 
 
 class PanoramaEncoder(nnx.Module):
@@ -51,7 +49,8 @@ class PanoramaEncoder(nnx.Module):
     def __call__(self, occupied: Array) -> Array:
         """M_env (N, H, W) -> (N, H/2, W/2, K * channels)."""
         # One map after the other: rays of a batch of maps would all wait for the last one.
-        views = jax.lax.map(lambda one: expected_views(one, self.config), occupied)
+        ranges = jax.lax.map(lambda one: expected_ranges(one, self.config), occupied)
+        views = view_features(ranges, self.config)
         x = self.project(self.block(views.reshape(-1, *views.shape[-2:])))
         x = x * jax.lax.rsqrt((x * x).sum(-1, keepdims=True) + 1e-6)
         return x.reshape(*views.shape[:-2], -1)
