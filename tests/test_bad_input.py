@@ -148,6 +148,8 @@ def test_localize_with_spoilt_files(good, refused, tmp_path, kind):
         (("--proposal", "dsom", "--checkpoint", "broken"), ["broken/provenance.json", "not JSON"]),
         (("--proposal", "dsom", "--checkpoint", "empty"), ["empty/provenance.json", "format"]),
         (("--proposal", "dsom", "--checkpoint", "net"), ["net", "does not fit the lidar", "range_max 5 m"]),
+        (("--checkpoint", "net"), ["--checkpoint net", "no use with --proposal likelihood_grid", "leave it out"]),
+        (("--proposal", "dsom", "--method", "mcl", "--checkpoint", "net"), ["--checkpoint net", "--method mcl"]),
         (("--out", "room.yaml"), ["--out room.yaml", "cannot write"]),
         (("--out", "room.yaml/deeper"), ["--out room.yaml/deeper", "cannot write"]),
     ],
@@ -203,6 +205,11 @@ def test_bench_with_a_checkpoint_that_does_not_fit(refused, tmp_path, folder, fr
     checkpoint.save(tmp_path / "far", create(DSOMConfig(width=2, headings=4, reach_min=12.0)))
     error = refused(bench.main, "--methods", "adam_dsom", "--checkpoint", folder, "--out", "out")
     assert folder in error and fragment in error
+
+
+def test_bench_with_a_checkpoint_that_no_method_draws_from(refused):
+    error = refused(bench.main, "--methods", "mcl,adam_likelihood_grid", "--checkpoint", "net", "--out", "out")
+    assert "--checkpoint net" in error and "no use" in error and "adam_dsom" in error
 
 
 COMMANDS = [name for name in ("localize", "bench", "train", "evaluate") if importlib.util.find_spec(f"dsom_jax.{name}")]

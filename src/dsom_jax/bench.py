@@ -144,6 +144,15 @@ def chosen_methods(names: str, checkpoint: Path | None) -> tuple[str, ...]:
     return methods
 
 
+def check_checkpoint(args: Args, methods: Sequence[str]) -> None:
+    """UserError for a network that is named and that no method draws from."""
+    if args.checkpoint and not any(map(needs_checkpoint, methods)):
+        raise UserError(
+            f"--checkpoint {args.checkpoint}: has no use with --methods {','.join(methods)}; "
+            f"leave it out, or add one of {', '.join(filter(needs_checkpoint, METHODS))}"
+        )
+
+
 def run_method(name: str, suite: Suite, keys: Sequence[Key], build: Build, progress: Advance | None = None) -> Record:
     """One method on all sequences."""
     parts: dict[str, dict[str, list[metrics.Runs]]] = {e: {"global": [], "kidnap": []} for e in ESTIMATES}
@@ -270,6 +279,7 @@ def main() -> None:
     settings = Settings(args.runs, args.particles, args.t_cut, args.seed)
     checkpoint = args.checkpoint or networks.shipped()
     methods = chosen_methods(args.methods, checkpoint)
+    check_checkpoint(args, methods)
     suite = load_suite(args.suite)
     network = networks.load(checkpoint, suite.lidar) if checkpoint and any(map(needs_checkpoint, methods)) else None
     folder = report.output_folder(args.out) if args.out else None

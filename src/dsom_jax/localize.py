@@ -117,10 +117,19 @@ def check(args: Args) -> None:
         raise UserError(f"--steps-per-segment {args.steps_per_segment}: give at least 6, or 0 for the whole log")
     if not 0 < args.t_cut < 1:
         raise UserError(f"--t-cut {args.t_cut}: give a number between 0 and 1 (the paper uses 0.6)")
-    if needs_network(args) and network_folder(args) is None:
-        raise UserError(f"--proposal {args.proposal}: give --checkpoint, the folder of a trained network")
+    check_network(args)
     if args.kidnap and args.segments < 2:
         raise UserError(f"--segments {args.segments}: --kidnap joins two segments, give at least 2")
+
+
+def check_network(args: Args) -> None:
+    """UserError if a network is needed and none there, or one is named and nothing draws from it."""
+    if needs_network(args) and network_folder(args) is None:
+        raise UserError(f"--proposal {args.proposal}: give --checkpoint, the folder of a trained network")
+    if args.checkpoint and not needs_network(args):
+        chosen = "--method mcl" if args.method == "mcl" else f"--proposal {args.proposal}"
+        fix = "leave it out, or give --proposal dsom or hybrid and a --method other than mcl"
+        raise UserError(f"--checkpoint {args.checkpoint}: has no use with {chosen}; {fix}")
 
 
 def limited(log: RawLog, range_max: float) -> RawLog:
@@ -165,9 +174,9 @@ def network_folder(args: Args) -> Path | None:
 
 
 def load_network(args: Args, lidar: LidarConfig) -> Any:
-    """The trained network that the arguments ask for, None without."""
-    folder = network_folder(args) if needs_network(args) or args.checkpoint else None
-    return None if folder is None or args.method == "mcl" else checkpoint.load(folder, lidar=lidar)
+    """The trained network that the arguments ask for, None if nothing draws from one."""
+    folder = network_folder(args) if needs_network(args) else None
+    return None if folder is None else checkpoint.load(folder, lidar=lidar)
 
 
 def build(args: Args, grid: OccupancyGrid, lidar: LidarConfig, network: Any = None) -> Filter:
