@@ -19,10 +19,11 @@ import numpy as np
 import tyro
 from timing import machine, measure, save
 
+from dsom_jax.compiling import training_options
 from dsom_jax.nn import create, encode_map, evaluation_view, log_probability_map
 from dsom_jax.nn.panorama import expected_views
 from dsom_jax.training.batches import Batch
-from dsom_jax.training.loop import TrainConfig, compiler_options, init_state, make_batches, make_step
+from dsom_jax.training.loop import TrainConfig, init_state, make_batches, make_step
 from dsom_jax.training.memory import keep_freed_memory
 from dsom_jax.training.target import dense, make_target, pooled
 
@@ -47,7 +48,7 @@ def inference(config: TrainConfig, occupied: Any, ranges: Any) -> Call:
     """One scan on a map with cached features."""
     model = evaluation_view(create(config.model))
     features = jax.jit(encode_map)(model, occupied)
-    scan = jax.jit(log_probability_map, static_argnums=3, compiler_options=compiler_options())
+    scan = jax.jit(log_probability_map, static_argnums=3, compiler_options=training_options())
     return lambda: scan(model, features, ranges, config.scan.lidar)
 
 
