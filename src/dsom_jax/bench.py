@@ -63,12 +63,12 @@ class Settings:
 
     def __post_init__(self) -> None:
         for name, value in (("--runs", self.runs), ("--particles", self.particles)):
-            if value < 1:
-                raise UserError(f"{name} {value}: give at least 1")
+            if not 1 <= value <= 1_000_000:
+                raise UserError(f"{name} {value}: give at least 1 and at most 1000000")
         if not 0 < self.t_cut < 1:
             raise UserError(f"--t-cut {self.t_cut}: give a number between 0 and 1 (the paper uses 0.6)")
-        if self.seed < 0:
-            raise UserError(f"--seed {self.seed}: give 0 or more")
+        if not 0 <= self.seed < 2**32:
+            raise UserError(f"--seed {self.seed}: give 0 or more, and less than 2^32")
 
 
 class Record(NamedTuple):

@@ -16,7 +16,7 @@ from rich.progress import Progress
 from dsom_jax import checkpoint, metrics, report
 from dsom_jax.cli import parse
 from dsom_jax.data import RawLog, load_log, load_ros_map, save_tum
-from dsom_jax.data.cut import segment_indices, splice, to_episode
+from dsom_jax.data.cut import refuse_repeats, segment_indices, splice, to_episode
 from dsom_jax.episode import Episode
 from dsom_jax.errors import UserError, run_cli
 from dsom_jax.filters.methods import DRAWN, REAL, make_filter, make_proposal
@@ -70,6 +70,9 @@ class Args:
     """Seed of all randomness."""
 
 
+MANY = 1_000_000
+
+
 class Drive(NamedTuple):
     """One episode to localize, and the log's stamps (T,) of its updates."""
 
@@ -110,6 +113,9 @@ def check(args: Args) -> None:
     for name in ("particles", "runs", "segments", "max_beams", "laser_max_range"):
         if not getattr(args, name) > 0:
             raise UserError(f"--{name.replace('_', '-')} {getattr(args, name)}: give a positive number")
+    for name, most in (("particles", MANY), ("runs", MANY), ("segments", MANY), ("seed", 2**32 - 1)):
+        if getattr(args, name) > most:
+            raise UserError(f"--{name} {getattr(args, name)}: give at most {most}")
     for name in ("update_min_d", "update_min_a", "seed"):
         if not getattr(args, name) >= 0:
             raise UserError(f"--{name.replace('_', '-')} {getattr(args, name)}: must not be negative")
@@ -153,6 +159,7 @@ def cut(log: RawLog, args: Args) -> list[Drive]:
             f"{log.path}: segments of {rows.shape[1]} updates are too short to judge, need {metrics.HOLD + 1}; "
             "give a longer log, fewer --segments or smaller --update-min-d and --update-min-a"
         )
+    refuse_repeats(log, rows)
     pieces = [Drive(to_episode(log, row), log.stamps[row]) for row in rows]
     if not args.kidnap:
         return pieces
