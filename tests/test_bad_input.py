@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -82,11 +83,16 @@ def gzip_cut_short(folder: Path) -> None:
 
 
 LOCALIZE = ("--map", "room.yaml", "--log", "drive.log", "--out", "out", "--runs", "2", "--particles", "10")
+LOCALIZE += ("--segments", "2", "--steps-per-segment", "20")
 FILES = {
     "no map": (lambda d: (d / "room.yaml").unlink(), ["room.yaml", "no such map yaml"]),
     "map is no yaml": (lambda d: (d / "room.yaml").write_text("a: [1"), ["room.yaml", "not valid YAML"]),
     "map is a picture": (lambda d: (d / "room.yaml").write_bytes(PGM + bytes(range(240, 256))), ["room.yaml"]),
     "no resolution": (lambda d: replaced(d / "room.yaml", "resolution", "scale"), ["room.yaml", "'resolution'"]),
+    "a resolution of nothing": (
+        lambda d: replaced(d / "room.yaml", "resolution: 0.25", "resolution: 1e-9"),
+        ["room.yaml", "resolution = 1e-09", "0.001 to 10"],
+    ),
     "origin": (
         lambda d: replaced(d / "room.yaml", "origin: [", "origin: [x, "),
         ["room.yaml", "[x, y, yaw]"],
@@ -148,6 +154,11 @@ def test_localize_with_spoilt_files(good, refused, tmp_path, kind):
         (("--proposal", "dsom", "--checkpoint", "broken"), ["broken/provenance.json", "not JSON"]),
         (("--proposal", "dsom", "--checkpoint", "empty"), ["empty/provenance.json", "format"]),
         (("--proposal", "dsom", "--checkpoint", "net"), ["net", "does not fit the lidar", "range_max 5 m"]),
+        (("--particles", "100000000000"), ["--particles 100000000000", "at most 1000000"]),
+        (("--seed", "4294967296"), ["--seed 4294967296", "at most"]),
+        (("--segments", "50"), ["drive.log", "25 different segments of 20 updates", "fewer --segments"]),
+        (("--checkpoint", "net"), ["--checkpoint net", "no use with --proposal likelihood_grid", "leave it out"]),
+        (("--proposal", "dsom", "--method", "mcl", "--checkpoint", "net"), ["--checkpoint net", "--method mcl"]),
         (("--out", "room.yaml"), ["--out room.yaml", "cannot write"]),
         (("--out", "room.yaml/deeper"), ["--out room.yaml/deeper", "cannot write"]),
     ],
@@ -178,6 +189,11 @@ def test_a_checkpoint_whose_weights_are_of_another_configuration(good, refused, 
     record_path.write_text(json.dumps({**described, "model": {**described["model"], "width": 3}}))
     error = refused(localize.main, *LOCALIZE, "--proposal", "dsom", "--checkpoint", "small")
     assert "small/weights" in error and "another configuration" in error
+    for part in (tmp_path / "big").rglob("*"):
+        if part.is_file() and part.name != "provenance.json":
+            part.write_bytes(part.read_bytes()[: part.stat().st_size // 2])
+    error = refused(localize.main, *LOCALIZE, "--proposal", "dsom", "--checkpoint", "big")
+    assert "big/weights" in error and "damaged" in error
 
 
 @pytest.mark.parametrize(
@@ -203,6 +219,11 @@ def test_bench_with_a_checkpoint_that_does_not_fit(refused, tmp_path, folder, fr
     checkpoint.save(tmp_path / "far", create(DSOMConfig(width=2, headings=4, reach_min=12.0)))
     error = refused(bench.main, "--methods", "adam_dsom", "--checkpoint", folder, "--out", "out")
     assert folder in error and fragment in error
+
+
+def test_bench_with_a_checkpoint_that_no_method_draws_from(refused):
+    error = refused(bench.main, "--methods", "mcl,adam_likelihood_grid", "--checkpoint", "net", "--out", "out")
+    assert "--checkpoint net" in error and "no use" in error and "adam_dsom" in error
 
 
 COMMANDS = [name for name in ("localize", "bench", "train", "evaluate") if importlib.util.find_spec(f"dsom_jax.{name}")]
@@ -237,6 +258,71 @@ def test_help_is_no_error(main, monkeypatch, capsys):
     with pytest.raises(SystemExit) as stop:
         run_cli(main)
     assert not stop.value.code and "--out" in capsys.readouterr().out
+
+
+TRAIN = ("--config", "tiny.yaml", "--steps", "2", "--out", "out")
+
+
+@pytest.mark.parametrize(
+    ("words", "fragments"),
+    [
+        (("--config", "nowhere.yaml"), ["nowhere.yaml", "cannot read"]),
+        (("--config", "room.pgm"), ["room.pgm", "cannot read"]),
+        (("--config", "nan.yaml"), ["nan.yaml", "TrainConfig.learning_rate = nan"]),
+        (("--config", "pair.yaml"), ["pair.yaml", "scan: obstacles", "expected 2 values"]),
+        (("--maps", "nowhere.yaml"), ["nowhere.yaml", "no such map yaml"]),
+        (("--init", "net"), ["net", "field model", "width = 2, the run's is 32"]),
+        (("--save-steps", "0"), ["--save-steps 0"]),
+        (("--save-minutes", "nan"), ["--save-minutes nan"]),
+        (("--out", "room.yaml"), ["--out room.yaml", "is a file"]),
+        (("--out", "room.yaml/deeper"), ["room.yaml/deeper", "cannot write"]),
+    ],
+    ids=lambda part: " ".join(part) if isinstance(part, tuple) else "",
+)
+def test_train_with_wrong_words(good, refused, tmp_path, words, fragments):
+    for name, text in (("tiny", "warmup: 3"), ("nan", "learning_rate: .nan"), ("pair", "scan: {obstacles: [1]}")):
+        (tmp_path / f"{name}.yaml").write_text(text)
+    error = refused(train.main, *TRAIN, *words)
+    assert all(fragment in error for fragment in fragments), error
+
+
+def test_a_run_is_resumed_on_its_own_maps(good, refused, tmp_path):
+    facts = {"config": {}, "maps": ["a.yaml"], "total": 2, "seconds": 0.0}
+    (tmp_path / "old").mkdir()
+    (tmp_path / "old" / "run.json").write_text(json.dumps(facts))
+    error = refused(train.main, "--resume", "--out", "old", "--maps", "room.yaml")
+    assert "--maps" in error and "a.yaml" in error and "resume without --maps" in error
+
+
+def test_evaluate_writes_nothing_for_a_map_that_is_none(good, refused):
+    error = refused(evaluate.main, "--checkpoint", "net", "--maps", "nowhere.yaml", "--out", "out")
+    assert "nowhere.yaml" in error
+
+
+@pytest.mark.parametrize("error", [MemoryError("99 GB"), RuntimeError("INTERNAL: Out of memory allocating 9 bytes.")])
+def test_too_much_asked_of_the_memory(error, capsys):
+    def main() -> None:
+        raise error
+
+    with pytest.raises(SystemExit) as stop:
+        run_cli(main)
+    shown = capsys.readouterr().err
+    assert stop.value.code == 2 and shown.startswith("error: out of memory") and shown.count("\n") == 1
+
+
+def test_other_faults_are_not_hidden():
+    def main() -> None:
+        raise RuntimeError("a fault of ours")
+
+    with pytest.raises(RuntimeError, match="of ours"):
+        run_cli(main)
+
+
+def test_a_terminal_that_knows_ascii_only(tmp_path):
+    command = [sys.executable, "-m", "dsom_jax.localize", "--map", "a", "--log", "b", "--out", "c", "--runs", "1.5"]
+    plain = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    done = subprocess.run(command, cwd=tmp_path, env=plain, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 2 and "--runs" in done.stderr and "1.5" in done.stderr and "---" not in done.stderr
 
 
 def test_errors_of_several_lines_become_one(capsys):

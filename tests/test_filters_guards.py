@@ -11,15 +11,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from dsom_jax import pose_grid as pg
 from dsom_jax.filters.adam import AdamMCL
 from dsom_jax.filters.adam_robust import RobustConfig
 from dsom_jax.filters.updates import FilterConfig
+from dsom_jax.occupancy import is_free
 from dsom_jax.sensor import ScoreModel
 from dsom_jax.types import Inputs
 from filters_kit import (  # noqa: F401, fixtures
     FILTERS,
     LIDAR,
     MCL_ONLY,
+    Spot,
     at,
     episode,
     everyone,
@@ -27,6 +30,7 @@ from filters_kit import (  # noqa: F401, fixtures
     grid,
     in_spot,
     init,
+    robust,
     spot,
     step,
     tiny_trust,
@@ -107,6 +111,21 @@ def test_an_update_keeps_the_types_of_the_state(name, world, spot, episode):
     after, _ = jax.eval_shape(lambda key, state: f.step(key, state, now, spot.pm), jax.random.key(0), before)
     kinds = [[(v.shape, v.dtype, v.weak_type) for v in jax.tree.leaves(state)] for state in (before, after)]
     assert kinds[0] == kinds[1]
+
+
+def test_a_pose_drawn_where_nobody_can_stand_weighs_nothing(world, spot, episode, grid):
+    wall = np.asarray(spot.pm.mass).copy()
+    wall[0, :, 3] = 1.0
+    assert not np.asarray(grid.free)[0].any()
+    f = robust(world, Spot(pg.probability_map(spot.pm.pose_grid, jnp.asarray(wall))), 200)
+    blind = Inputs(jnp.full(LIDAR.beams, jnp.nan), jnp.zeros(3), jnp.int32(0))
+    state, info = step(f, jax.random.key(0), init(f, jax.random.key(1)), blind)
+    free = np.asarray(is_free(grid, state.poses))
+    weights = np.exp(np.asarray(state.log_weights))
+    assert 1 <= free.sum() < 40 and not weights[~free].any() and not bool(info.restarted)
+    np.testing.assert_allclose(weights[free], 1 / free.sum(), rtol=1e-3)
+    state, info = step(f, jax.random.key(2), state, at(episode, 1))
+    assert_sound(state, info, 200)
 
 
 def test_no_particles_are_refused():

@@ -12,7 +12,7 @@ import dsom_jax
 
 ROOT = Path(dsom_jax.__file__).parent
 LAYERS = (
-    ("types", "geometry", "errors"),
+    ("types", "geometry", "errors", "checks", "compiling"),
     ("occupancy", "lidar", "raycast", "resampling", "pose_grid", "episode"),
     ("motion", "sensor", "nn", "simulate"),
     ("proposals", "metrics"),

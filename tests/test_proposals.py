@@ -13,6 +13,7 @@ from scipy import ndimage, stats
 
 import tiny_world
 from dsom_jax import pose_grid as pg
+from dsom_jax.geometry import compose
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.occupancy import cell_index, from_cells, is_free
 from dsom_jax.proposals.dual_features import DualFeaturesConfig, dual_features, scan_features, with_episode
@@ -28,6 +29,7 @@ MODEL = BeamModel(sigma_hit=0.2, temper=0.5, range_max=LIDAR.range_max)
 CONFIG = LikelihoodGridConfig(resolution=0.25, headings=16, angles_per_heading=2, beams=32, model=MODEL)
 prepare = jax.jit(lambda proposal, inputs: proposal.prepare(inputs))
 sample = jax.jit(lambda proposal, key, prepared, n: proposal.sample(key, prepared, n), static_argnums=3)
+log_density = jax.jit(lambda proposal, pm, poses: proposal.log_density(pm, poses))
 
 
 def inputs(ranges, index=0):
@@ -144,6 +146,70 @@ def test_coarser_cells_keep_every_free_place(grid):
     np.testing.assert_array_equal(coarse.free, (~tiny_world.cells()).reshape(10, 2, 12, 2).any((1, 3)))
     assert coarse.resolution == pytest.approx(0.5)
     assert resample_free(grid, 0.1).resolution == pytest.approx(0.25)  # no finer than the map
+
+
+def ragged(seed, resolution=0.1, origin=(-3.0, 40.0, 0.7)):
+    """A map of which any cell may be free, occupied or unknown."""
+    kind = np.random.default_rng(seed).choice(3, (19, 23), p=[0.6, 0.2, 0.2])
+    return from_cells(kind == 1, kind == 0, resolution=resolution, origin=origin)
+
+
+def stands(grid, poses, slack=1e-4):
+    """Whether poses lie on free cells, but for rounding (``slack`` metres) at their edges."""
+    steps = slack * np.array([[0, 0, 0], [1, 1, 0], [1, -1, 0], [-1, 1, 0], [-1, -1, 0]])
+    return np.asarray(is_free(grid, jnp.asarray(poses)[:, None] + jnp.asarray(steps, jnp.float32))).any(-1)
+
+
+@pytest.mark.parametrize("resolution", [0.1, 0.2, 0.5])
+@pytest.mark.parametrize("offset", [0.0, 0.4])
+@pytest.mark.parametrize("seed", range(3))
+def test_every_pose_drawn_is_on_free_space(resolution, offset, seed):
+    """Whatever the ratio of cells; with a mounting offset it is the sensor that stands there."""
+    grid, lidar = ragged(seed), replace(LIDAR, mount=(offset, -offset, 0.5))
+    coarse = likelihood_grid(grid, lidar, replace(CONFIG, resolution=resolution))
+    pm = prepare(coarse, inputs(np.random.default_rng(seed).uniform(0.1, 4.0, LIDAR.beams)))
+    poses, log_q = sample(coarse, jax.random.key(seed), pm, 2_000)
+    assert stands(grid, compose(poses, jnp.array([offset, -offset, 0.0]))).all()
+    same = np.abs(np.asarray(log_density(coarse, pm, poses)) - log_q) < 1e-3
+    assert same.mean() > 0.995  # but for rounding at the edges of cells
+
+
+@pytest.mark.parametrize("resolution", [0.1, 0.3])
+def test_log_densities_are_those_that_poses_are_drawn_from(resolution):
+    grid, n = ragged(5), 40_000
+    coarse = likelihood_grid(grid, LIDAR, replace(CONFIG, resolution=resolution))
+    volume = np.asarray(grid.free).sum() * 0.1**2 * 2 * np.pi
+    _, log_q = sample(coarse, jax.random.key(0), prepare(coarse, inputs(np.full(LIDAR.beams, np.nan))), n)
+    np.testing.assert_allclose(np.exp(-np.asarray(log_q, np.float64)), volume, rtol=1e-3)
+    # With some evidence, so that every cell keeps some mass: E_q[1 / q] is the volume of free space.
+    pm = prepare(coarse, inputs(np.where(np.arange(LIDAR.beams) % 8, np.nan, 0.7)))
+    poses, log_q = sample(coarse, jax.random.key(1), pm, n)
+    inverse = np.exp(-np.asarray(log_q, np.float64))
+    assert abs(inverse.mean() - volume) < 5 * inverse.std() / math.sqrt(n)
+    # The map's own cells are met as often as the density at their centres says.
+    share = densities(coarse, pm, grid, np.asarray(grid.free)).sum(-1) * 0.1**2 * 2 * np.pi / CONFIG.headings
+    assert share.sum() == pytest.approx(1.0, abs=1e-3)
+    counts = np.zeros(grid.shape)
+    np.add.at(counts, tuple(np.asarray(v) for v in cell_index(grid, poses)), 1)
+    seen, expected = counts[np.asarray(grid.free)], n * share / share.sum()
+    assert seen.sum() > 0.999 * n and expected.min() > 5
+    assert stats.chisquare(seen * n / seen.sum(), expected).pvalue > 1e-3
+
+
+def densities(proposal, pm, grid, chosen):
+    """(C, K) densities at the centres of the chosen cells (H, W) of the map."""
+    i, j = (v[:, None] for v in np.nonzero(chosen))
+    cells = np.broadcast_arrays(i, j, np.arange(CONFIG.headings))
+    centres = pg.cell_pose(pg.over(grid, CONFIG.headings), *map(jnp.asarray, cells))
+    return np.exp(np.asarray(log_density(proposal, pm, centres), np.float64))
+
+
+def test_there_is_no_density_where_nobody_can_stand():
+    grid = ragged(5)
+    coarse = likelihood_grid(grid, LIDAR, replace(CONFIG, resolution=0.3))
+    pm = prepare(coarse, inputs(np.full(LIDAR.beams, np.nan)))
+    assert not densities(coarse, pm, grid, ~np.asarray(grid.free)).any()
+    assert np.isneginf(log_density(coarse, pm, jnp.array([[500.0, 0.0, 0.0], [np.nan, 0.0, 0.0]]))).all()
 
 
 @pytest.mark.parametrize("reading", [np.nan, -np.inf])

@@ -16,7 +16,7 @@ import numpy as np
 import tyro
 from timing import machine, measure, save
 
-from dsom_jax import montecarlo
+from dsom_jax.compiling import run_options
 from dsom_jax.data.suite import load_suite
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.occupancy import OccupancyGrid
@@ -51,7 +51,7 @@ def cast(
     """Times of one method, and its ranges (R, N, B)."""
     build = partial(make_tables, grid, config, lidar.range_max)
     tables = build()
-    call = jax.jit(cast_rays, static_argnums=2, compiler_options=montecarlo._options())
+    call = jax.jit(cast_rays, static_argnums=2, compiler_options=run_options())
     times = measure(lambda: call(tables, poses, lidar), repeats)
     rays = poses[..., 0].size * lidar.beams
     rates = {f"rays_per_s_{kind}": 1e3 * rays / times[f"{kind}_ms"] for kind in ("wall", "cpu")}

@@ -16,6 +16,7 @@ import tyro
 from timing import machine, measure, save
 
 from dsom_jax import montecarlo
+from dsom_jax.compiling import run_options
 from dsom_jax.data.suite import load_suite
 from dsom_jax.episode import Episode
 from dsom_jax.filters import updates
@@ -72,7 +73,7 @@ def method_times(filter: Any, episode: Episode, runs: int, repeats: int, warm: i
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     """``function`` under jit, with the options of the Monte-Carlo runs."""
-    return jax.jit(function, compiler_options=montecarlo._options())
+    return jax.jit(function, compiler_options=run_options())
 
 
 def all_runs(filter: Any, keys: Any, states: Any, now: Inputs, prepared: Any) -> Any:

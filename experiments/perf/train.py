@@ -19,7 +19,7 @@ import numpy as np
 import tyro
 from timing import machine, measure, save
 
-from dsom_jax import montecarlo
+from dsom_jax.compiling import run_options
 from dsom_jax.nn import create, encode_map, evaluation_view, log_probability_map
 from dsom_jax.nn.panorama import expected_ranges, view_features
 from dsom_jax.training.batches import Batch
@@ -48,7 +48,7 @@ def inference(config: TrainConfig, occupied: Any, ranges: Any) -> Call:
     """One scan on a map with cached features."""
     model = evaluation_view(create(config.model))
     features = jax.jit(encode_map)(model, occupied)
-    scan = jax.jit(log_probability_map, static_argnums=3, compiler_options=montecarlo._options())
+    scan = jax.jit(log_probability_map, static_argnums=3, compiler_options=run_options())
     return lambda: scan(model, features, ranges, config.scan.lidar)
 
 

@@ -63,12 +63,12 @@ class Settings:
 
     def __post_init__(self) -> None:
         for name, value in (("--runs", self.runs), ("--particles", self.particles)):
-            if value < 1:
-                raise UserError(f"{name} {value}: give at least 1")
+            if not 1 <= value <= 1_000_000:
+                raise UserError(f"{name} {value}: give at least 1 and at most 1000000")
         if not 0 < self.t_cut < 1:
             raise UserError(f"--t-cut {self.t_cut}: give a number between 0 and 1 (the paper uses 0.6)")
-        if self.seed < 0:
-            raise UserError(f"--seed {self.seed}: give 0 or more")
+        if not 0 <= self.seed < 2**32:
+            raise UserError(f"--seed {self.seed}: give 0 or more, and less than 2^32")
 
 
 class Record(NamedTuple):
@@ -142,6 +142,15 @@ def chosen_methods(names: str, checkpoint: Path | None) -> tuple[str, ...]:
     methods = methods or tuple(name for name in STANDARD if checkpoint or not needs_checkpoint(name))
     check_methods(methods, checkpoint)
     return methods
+
+
+def check_checkpoint(args: Args, methods: Sequence[str]) -> None:
+    """UserError for a network that is named and that no method draws from."""
+    if args.checkpoint and not any(map(needs_checkpoint, methods)):
+        raise UserError(
+            f"--checkpoint {args.checkpoint}: has no use with --methods {','.join(methods)}; "
+            f"leave it out, or add one of {', '.join(filter(needs_checkpoint, METHODS))}"
+        )
 
 
 def run_method(name: str, suite: Suite, keys: Sequence[Key], build: Build, progress: Advance | None = None) -> Record:
@@ -270,6 +279,7 @@ def main() -> None:
     settings = Settings(args.runs, args.particles, args.t_cut, args.seed)
     checkpoint = args.checkpoint or networks.shipped()
     methods = chosen_methods(args.methods, checkpoint)
+    check_checkpoint(args, methods)
     suite = load_suite(args.suite)
     network = networks.load(checkpoint, suite.lidar) if checkpoint and any(map(needs_checkpoint, methods)) else None
     folder = report.output_folder(args.out) if args.out else None

@@ -7,6 +7,7 @@ weights. Both are written under other names and renamed, the json last, so that 
 from __future__ import annotations
 
 import json
+import logging
 import os
 import shutil
 import warnings
@@ -131,6 +132,9 @@ def _load_tree(path: Path, like: T) -> T:
     if not path.is_dir():
         raise UserError(f"{path}: the folder of the weights is missing; copy the whole checkpoint or train again")
     abstract = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), like)
+    chatter = logging.getLogger("absl")  # where orbax logs what it also raises
+    level = chatter.level
+    chatter.setLevel(logging.CRITICAL)
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="Sharding info not provided")  # one device or many: as it comes
@@ -138,6 +142,8 @@ def _load_tree(path: Path, like: T) -> T:
     except Exception as error:  # orbax and tensorstore raise many kinds; all mean that the files do not fit
         reason = f"weights are damaged or of another configuration ({_first_line(error)})"
         raise UserError(f"{path}: {reason}; train again") from error
+    finally:
+        chatter.setLevel(level)
     for new, old in zip(jax.tree.leaves(tree), jax.tree.leaves(like), strict=True):
         if new.shape != old.shape:
             raise UserError(f"{path}: weights {new.shape} where the configuration has {old.shape}; train again")

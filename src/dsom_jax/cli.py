@@ -12,7 +12,8 @@ import tyro
 from dsom_jax.errors import UserError
 
 T = TypeVar("T")
-_FRAME = re.compile(r"\x1b\[[0-9;]*m|[│╭╮╰╯]")
+_FRAME = re.compile(r"\x1b\[[0-9;]*m|[│╭╮╰╯]|^\s*[|+]|[|+]\s*$")
+"""Frames of boxes; terminals that know ASCII only get them from | + and -."""
 
 
 def parse(arguments: type[T], prog: str) -> T:
@@ -33,6 +34,6 @@ def parse(arguments: type[T], prog: str) -> T:
 def one_line(box: str) -> str:
     """The message in the box that tyro draws: its first section, and the second if that offers a correction."""
     rows = [_FRAME.sub("", row).strip() for row in box.splitlines()[1:]]
-    sections = re.split(r"─{3,}", " ".join(row for row in rows if row))
+    sections = [part for part in re.split(r"[─-]{3,}", " ".join(row for row in rows if row)) if part.strip()] or [""]
     told = [sections[0], *(part for part in sections[1:2] if part.lstrip().startswith("Perhaps"))]
     return "; ".join(part.strip().rstrip(".:") for part in told)

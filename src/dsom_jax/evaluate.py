@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,6 +31,8 @@ from dsom_jax.types import Array, Key, Proposal
 
 PROPOSALS = ("uniform", "dual_features", "dsom", "likelihood_grid", "hybrid")
 WORST = 5
+KEPT = 16
+"""Scenes whose proposals are kept in memory."""
 _UNSEEN = 0x5EE0
 """Folded into the seed, so that these worlds are none of those that training draws."""
 
@@ -65,6 +67,9 @@ class Scene(NamedTuple):
     poses: Array
 
 
+Sources = Callable[[int], dict[str, Proposal]]
+
+
 def main() -> None:
     """Command line."""
     args = parse(Args, "python -m dsom_jax.evaluate")
@@ -72,26 +77,28 @@ def main() -> None:
     scan = replace(PLAIN, obstacles=(args.obstacles, args.obstacles))
     lidar = narrowed(scan.lidar, args.fov)
     network = checkpoint.load(args.checkpoint, lidar)
+    given = given_maps(args, network) if args.maps else None
     folder = report.output_folder(args.out)
-    grids = given_maps(args, network) if args.maps else new_worlds(args, network)
+    grids = given or new_worlds(args, network)
     scenes = [simulate(key, grid, scan, lidar, args) for key, grid in grids]
+    sources = proposals(scenes, lidar, network)
     with Progress(console=report.terminal(stderr=True)) as progress:
         track = partial(progress.track, description="scenes")
-        judged = judge_all(track(scenes), lidar, network)
+        judged = judge_all(track(scenes), sources)
     results = {name: quality.summarise(part) | {"ms_per_scan": ms} for name, (part, ms) in judged.items()}
     report.write_json(folder / "evaluate.json", results)
-    draw(folder, scenes, lidar, network, {name: part for name, (part, _) in judged.items()})
+    draw(folder, scenes, lidar, sources, {name: part for name, (part, _) in judged.items()})
     print_table(results)
 
 
 def check(args: Args) -> None:
     """UserError for settings that mean nothing."""
     for name in ("worlds", "scans"):
-        if getattr(args, name) < 1:
-            raise UserError(f"--{name} {getattr(args, name)}: give at least 1")
-    for name in ("obstacles", "seed"):
-        if getattr(args, name) < 0:
-            raise UserError(f"--{name} {getattr(args, name)}: must not be negative")
+        if not 1 <= getattr(args, name) <= 100_000:
+            raise UserError(f"--{name} {getattr(args, name)}: give at least 1 and at most 100000")
+    for name, most in (("obstacles", 10_000), ("seed", 2**32 - 1)):
+        if not 0 <= getattr(args, name) <= most:
+            raise UserError(f"--{name} {getattr(args, name)}: must not be negative, nor more than {most}")
     if not 1 <= args.fov <= 360:
         raise UserError(f"--fov {args.fov}: give degrees between 1 and 360")
 
@@ -136,18 +143,27 @@ def simulate(key: Key, grid: OccupancyGrid, scan: ScanConfig, lidar: LidarConfig
     return Scene(grid, ranges[:, first : first + lidar.beams], poses)
 
 
-def build(name: str, grid: OccupancyGrid, lidar: LidarConfig, network: DSOM) -> Proposal:
-    """Proposal ``name`` as the benchmark uses it, but for DSOM's PM, which is not sharpened: the network is judged."""
-    return make_proposal(name, grid, lidar, Settings(sharpness=1.0), checkpoint=network)
+def proposals(scenes: Sequence[Scene], lidar: LidarConfig, network: DSOM) -> Sources:
+    """The proposals of a scene by its number; the last few are kept, as pictures ask for them again."""
+
+    @lru_cache(maxsize=KEPT)
+    def build(number: int) -> dict[str, Proposal]:
+        made: dict[str, Proposal] = {}
+        for name in PROPOSALS:
+            # As the benchmark uses them, but for DSOM's PM, which is not sharpened: the network is judged.
+            settings = Settings(sharpness=1.0)
+            made[name] = make_proposal(name, scenes[number].grid, lidar, settings, checkpoint=network, made=made)
+        return made
+
+    return build
 
 
-def judge_all(scenes: Any, lidar: LidarConfig, network: DSOM) -> dict[str, tuple[quality.Quality, float]]:
+def judge_all(scenes: Iterable[Scene], sources: Sources) -> dict[str, tuple[quality.Quality, float]]:
     """Quality of every scan, in the order of the scenes, and milliseconds per scan, by proposal."""
     parts: dict[str, list[quality.Quality]] = {name: [] for name in PROPOSALS}
     times: dict[str, list[float]] = {name: [] for name in PROPOSALS}
-    for scene in scenes:
-        for name in PROPOSALS:
-            proposal = build(name, scene.grid, lidar, network)
+    for number, scene in enumerate(scenes):
+        for name, proposal in sources(number).items():
             part = quality.judge(proposal, scene.grid, scene.ranges, scene.poses)
             parts[name].append(jax.tree.map(np.asarray, part))
             times[name] += timed(partial(quality.prepare, proposal), scene.ranges[:3])
@@ -167,7 +183,7 @@ def timed(function: Callable[[Array], Any], scans: Array) -> list[float]:
 
 
 def draw(
-    folder: Path, scenes: list[Scene], lidar: LidarConfig, network: DSOM, parts: dict[str, quality.Quality]
+    folder: Path, scenes: list[Scene], lidar: LidarConfig, sources: Sources, parts: dict[str, quality.Quality]
 ) -> None:
     """Calibration of all proposals; for the two that are worth it, the worst scans and the first ones."""
     curves = {name: quality.calibration(np.asarray(part.level)) for name, part in parts.items()}
@@ -175,15 +191,16 @@ def draw(
     for name in ("dsom", "likelihood_grid", "hybrid"):
         worst = np.argsort(parts[name].mass, kind="stable")[:WORST]
         for title, chosen in (("worst", worst), ("first", np.arange(min(WORST, len(parts[name].mass))))):
-            views = [view(name, scenes, int(n), lidar, network) for n in chosen]
+            views = [view(name, scenes, int(n), lidar, sources) for n in chosen]
             titles = [f"mass {100 * parts[name].mass[n]:.2g} %" for n in chosen]
             plotting.save(plotting.map_views(views, titles), folder / f"{title}_{name}.png")
 
 
-def view(name: str, scenes: list[Scene], number: int, lidar: LidarConfig, network: DSOM) -> dict[str, Any]:
+def view(name: str, scenes: list[Scene], number: int, lidar: LidarConfig, sources: Sources) -> dict[str, Any]:
     """One scan, its true pose and the PM of proposal ``name``, for a picture."""
-    scene, n = scenes[number // len(scenes[0].poses)], number % len(scenes[0].poses)
-    pm = quality.prepare(build(name, scene.grid, lidar, network), scene.ranges[n])
+    which, n = divmod(number, len(scenes[0].poses))
+    scene = scenes[which]
+    pm = quality.prepare(sources(which)[name], scene.ranges[n])
     ends, hit = scan_points(scene.ranges[n], lidar)
     shown = {"pm": pm.mass, "pm_origin": pm.pose_grid.origin, "pm_resolution": pm.pose_grid.resolution}
     points = np.asarray(transform_points(scene.poses[n], ends))[np.asarray(hit)]

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from numbers import Real
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dsom_jax import checks
 from dsom_jax.types import Array, Key
 
 
@@ -35,13 +37,17 @@ class LidarConfig:
     upside_down: bool = False
 
     def __post_init__(self) -> None:
-        if self.beams < 1:
-            raise ValueError(f"LidarConfig.beams = {self.beams}: give at least one beam")
-        if not 0 <= self.range_min < self.range_max or not math.isfinite(self.range_max):
+        checks.count(self, "beams")
+        checks.finite(self, "angle_min angle_increment")
+        if not (_finite(self.mount) and len(self.mount) == 3):
+            raise ValueError(checks.message(self, "mount", "give x and y in metres and yaw in radians"))
+        if not (_finite((self.range_min, self.range_max)) and 0 <= self.range_min < self.range_max):
             raise ValueError(f"LidarConfig: need 0 <= range_min < range_max, got {self.range_min}, {self.range_max} m")
         spanned = (self.beams - 1) * abs(self.angle_increment)
         if abs(self.angle_min) > 2 * math.pi + 1e-3 or spanned > 2 * math.pi * 1.01:
-            raise ValueError("LidarConfig: beams span more than a turn. Did you pass degrees instead of radians?")
+            first, step = self.angle_min, self.angle_increment
+            span = f"LidarConfig: angle_min = {first:g}, {self.beams} beams with angle_increment = {step:g}"
+            raise ValueError(f"{span}: beams span more than a turn. Did you pass degrees instead of radians?")
 
     @property
     def fov(self) -> float:
@@ -73,6 +79,14 @@ class LidarNoise:
     sigma_relative: float = 0.0
     dropout: float = 0.0
     short: float = 0.0
+
+    def __post_init__(self) -> None:
+        checks.not_negative(self, "sigma sigma_relative")
+        checks.share(self, "dropout short")
+
+
+def _finite(values: tuple[float, ...]) -> bool:
+    return all(isinstance(v, Real) and math.isfinite(v) for v in values)
 
 
 def apply_limits(ranges: Array, lidar: LidarConfig) -> Array:

@@ -16,7 +16,7 @@ from rich.progress import Progress
 from dsom_jax import checkpoint, metrics, report
 from dsom_jax.cli import parse
 from dsom_jax.data import RawLog, load_log, load_ros_map, save_tum
-from dsom_jax.data.cut import segment_indices, splice, to_episode
+from dsom_jax.data.cut import refuse_repeats, segment_indices, splice, to_episode
 from dsom_jax.episode import Episode
 from dsom_jax.errors import UserError, run_cli
 from dsom_jax.filters.methods import DRAWN, REAL, make_filter, make_proposal
@@ -70,6 +70,9 @@ class Args:
     """Seed of all randomness."""
 
 
+MANY = 1_000_000
+
+
 class Drive(NamedTuple):
     """One episode to localize, and the log's stamps (T,) of its updates."""
 
@@ -110,6 +113,9 @@ def check(args: Args) -> None:
     for name in ("particles", "runs", "segments", "max_beams", "laser_max_range"):
         if not getattr(args, name) > 0:
             raise UserError(f"--{name.replace('_', '-')} {getattr(args, name)}: give a positive number")
+    for name, most in (("particles", MANY), ("runs", MANY), ("segments", MANY), ("seed", 2**32 - 1)):
+        if getattr(args, name) > most:
+            raise UserError(f"--{name} {getattr(args, name)}: give at most {most}")
     for name in ("update_min_d", "update_min_a", "seed"):
         if not getattr(args, name) >= 0:
             raise UserError(f"--{name.replace('_', '-')} {getattr(args, name)}: must not be negative")
@@ -117,10 +123,19 @@ def check(args: Args) -> None:
         raise UserError(f"--steps-per-segment {args.steps_per_segment}: give at least 6, or 0 for the whole log")
     if not 0 < args.t_cut < 1:
         raise UserError(f"--t-cut {args.t_cut}: give a number between 0 and 1 (the paper uses 0.6)")
-    if needs_network(args) and network_folder(args) is None:
-        raise UserError(f"--proposal {args.proposal}: give --checkpoint, the folder of a trained network")
+    check_network(args)
     if args.kidnap and args.segments < 2:
         raise UserError(f"--segments {args.segments}: --kidnap joins two segments, give at least 2")
+
+
+def check_network(args: Args) -> None:
+    """UserError if a network is needed and none there, or one is named and nothing draws from it."""
+    if needs_network(args) and network_folder(args) is None:
+        raise UserError(f"--proposal {args.proposal}: give --checkpoint, the folder of a trained network")
+    if args.checkpoint and not needs_network(args):
+        chosen = "--method mcl" if args.method == "mcl" else f"--proposal {args.proposal}"
+        fix = "leave it out, or give --proposal dsom or hybrid and a --method other than mcl"
+        raise UserError(f"--checkpoint {args.checkpoint}: has no use with {chosen}; {fix}")
 
 
 def limited(log: RawLog, range_max: float) -> RawLog:
@@ -144,6 +159,7 @@ def cut(log: RawLog, args: Args) -> list[Drive]:
             f"{log.path}: segments of {rows.shape[1]} updates are too short to judge, need {metrics.HOLD + 1}; "
             "give a longer log, fewer --segments or smaller --update-min-d and --update-min-a"
         )
+    refuse_repeats(log, rows)
     pieces = [Drive(to_episode(log, row), log.stamps[row]) for row in rows]
     if not args.kidnap:
         return pieces
@@ -165,9 +181,9 @@ def network_folder(args: Args) -> Path | None:
 
 
 def load_network(args: Args, lidar: LidarConfig) -> Any:
-    """The trained network that the arguments ask for, None without."""
-    folder = network_folder(args) if needs_network(args) or args.checkpoint else None
-    return None if folder is None or args.method == "mcl" else checkpoint.load(folder, lidar=lidar)
+    """The trained network that the arguments ask for, None if nothing draws from one."""
+    folder = network_folder(args) if needs_network(args) else None
+    return None if folder is None else checkpoint.load(folder, lidar=lidar)
 
 
 def build(args: Args, grid: OccupancyGrid, lidar: LidarConfig, network: Any = None) -> Filter:

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jax.sharding import AxisType, Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
+from dsom_jax.compiling import run_options
 from dsom_jax.episode import Episode
 from dsom_jax.types import Array, Filter, Inputs, Key
 
@@ -108,21 +109,4 @@ def _runner(mesh: Mesh) -> Any:
     spread = jax.shard_map(
         simulate, mesh=mesh, in_specs=(P(), P(), P(), P("runs")), out_specs=P("runs"), check_vma=False
     )
-    return jax.jit(spread, compiler_options=_options())
-
-
-def _options() -> dict[str, str]:
-    """Compiler options of a run on CPUs.
-
-    XLA's YNNPACK sums rows in an order that depends on how many rows there are, so that run r of 100 would differ from
-    run r alone in the last bits; XLA's own loops do not. Matrix products and convolutions keep the library. LLVM's
-    first level of optimisation compiles a quarter faster than its third, and what it makes is as fast here.
-    """
-    options = {"xla_cpu_experimental_ynn_fusion_type": "LIBRARY_FUSION_TYPE_DOT", "xla_backend_optimization_level": "1"}
-    if jax.default_backend() != "cpu":
-        return {}
-    try:
-        jax.jit(lambda x: x, compiler_options=options)(0.0)
-    except jax.errors.JaxRuntimeError:  # an XLA without this experimental switch
-        return {}
-    return options
+    return jax.jit(spread, compiler_options=run_options())

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax.scipy.stats import norm
 
+from dsom_jax import checks
 from dsom_jax.geometry import compose, relative, wrap_angle
 from dsom_jax.types import Array, Key
 
@@ -40,11 +41,9 @@ class OdometryMotion:
     tail_scale: float = 3.0
 
     def __post_init__(self) -> None:
-        if min(self.alpha1, self.alpha2, self.alpha3, self.alpha4, self.min_xy, self.min_theta) < 0:
-            raise ValueError("OdometryMotion: noise parameters cannot be negative")
-        for name, value in (("slip", self.slip), ("tail", self.tail)):
-            if not 0 <= value < 1:
-                raise ValueError(f"OdometryMotion.{name} = {value}: give a probability below one")
+        checks.not_negative(self, "alpha1 alpha2 alpha3 alpha4 min_xy min_theta")
+        checks.share(self, "slip tail", excluding=")")
+        checks.positive(self, "tail_scale")
 
     def spread(self, odometry: Array) -> tuple[Array, Array]:
         """Rotation-translation-rotation (3,) of an increment and the standard deviations (3,) of its parts."""
@@ -128,6 +127,9 @@ class OmniMotion:
     min_xy: float = 0.02
     min_theta: float = 0.01
 
+    def __post_init__(self) -> None:
+        checks.not_negative(self, "alpha1 alpha2 alpha3 alpha4 alpha5 min_xy min_theta")
+
     def spread(self, odometry: Array) -> Array:
         """Standard deviations (3,) along the direction of travel, across it, and of the heading."""
         travel2, turn2 = odometry[0] ** 2 + odometry[1] ** 2, odometry[2] ** 2
@@ -167,6 +169,9 @@ class AdditiveMapFrame:
 
     sigma_xy: float = 0.1
     sigma_theta: float = 0.05
+
+    def __post_init__(self) -> None:
+        checks.not_negative(self, "sigma_xy sigma_theta")
 
     def sample(self, key: Key, poses: Array, odometry: Array) -> Array:
         """One successor of each pose (..., 3)."""

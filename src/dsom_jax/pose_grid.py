@@ -120,24 +120,38 @@ def exp_or_zero(x: Array) -> Array:
 def sample(key: Key, pm: ProbabilityMap, n: int) -> tuple[Array, Array]:
     """``n`` poses (n, 3) drawn from PM, uniform within cell and bin, and their log densities in 1 / (m^2 rad)."""
     u = jax.random.uniform(key, (5, n))
-    cell = pick(pm.cumulative, u[0])
-    k = pick_in_rows(pm.within, cell, u[1])
+    cell, k = pick_cells(pm, u[:2])
     jitter = u[2:] - 0.5
-    i, j = cell // pm.pose_grid.width, cell % pm.pose_grid.width
+    i, j = jnp.divmod(cell, pm.pose_grid.width)
     poses = cell_pose(pm.pose_grid, i + jitter[0], j + jitter[1], k + jitter[2])
-    mass = pm.mass.reshape(-1)[cell * pm.pose_grid.headings + k]
-    return poses, jnp.log(mass) - jnp.log(pm.cumulative[-1]) - pm.pose_grid.log_cell_volume
+    return poses, log_share(pm, cell, k) - pm.pose_grid.log_cell_volume
+
+
+def pick_cells(pm: ProbabilityMap, positions: Array) -> tuple[Array, Array]:
+    """Cells (flat (i, j), k) (n,) drawn from PM by ``positions`` (2, n) in [0, 1)."""
+    cell = pick(pm.cumulative, positions[0])
+    return cell, pick_in_rows(pm.within, cell, positions[1])
+
+
+def log_share(pm: ProbabilityMap, cell: Array, k: Array) -> Array:
+    """Log of the normalised mass (...) of cells (flat (i, j), k)."""
+    return jnp.log(pm.mass.reshape(-1)[cell * pm.pose_grid.headings + k]) - jnp.log(pm.cumulative[-1])
 
 
 def log_density(pm: ProbabilityMap, poses: Array) -> Array:
     """Log density (...) of PM at map-frame poses (..., 3) in 1 / (m^2 rad); -inf off the grid and for NaN."""
-    cells = pose_cell(pm.pose_grid, poses)
+    i, j, k, on_grid = nearest_cell(pm.pose_grid, poses)
+    share = log_share(pm, jnp.where(on_grid, i * pm.pose_grid.width + j, 0), k)
+    return jnp.where(on_grid, share - pm.pose_grid.log_cell_volume, -jnp.inf)
+
+
+def nearest_cell(pose_grid: PoseGrid, poses: Array) -> tuple[Array, Array, Array, Array]:
+    """Cells (i, j, k) (...) that map-frame poses (..., 3) lie in, and whether they lie on the grid at all."""
     known = jnp.isfinite(poses).all(-1)
+    cells = pose_cell(pose_grid, poses)
     i, j, k = (jnp.round(jnp.where(known, v, -1)).astype(jnp.int32) for v in cells)
-    on_grid = (i >= 0) & (i < pm.pose_grid.height) & (j >= 0) & (j < pm.pose_grid.width)
-    cell = jnp.where(on_grid, i * pm.pose_grid.width + j, 0) * pm.pose_grid.headings + k % pm.pose_grid.headings
-    mass = jnp.where(on_grid, pm.mass.reshape(-1)[cell], 0.0)
-    return jnp.log(mass) - jnp.log(pm.cumulative[-1]) - pm.pose_grid.log_cell_volume
+    on_grid = (i >= 0) & (i < pose_grid.height) & (j >= 0) & (j < pose_grid.width)
+    return i, j, k % pose_grid.headings, on_grid
 
 
 def mass_near(pm: ProbabilityMap, pose: Array, radius: float, angle: float) -> Array:

@@ -14,6 +14,7 @@ from typing import Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from dsom_jax import checks
 from dsom_jax.geometry import compose
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.occupancy import OccupancyGrid, inside
@@ -42,10 +43,11 @@ class RaycastConfig:
     surface: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.method not in ("exact", "table"):
-            raise ValueError(f"RaycastConfig.method = {self.method!r}: use 'exact' or 'table'")
-        if self.angles < 4 or not 1 <= self.max_skip <= 255:
-            raise ValueError("RaycastConfig: need angles >= 4 and 1 <= max_skip <= 255")
+        checks.choice(self, "method", ("exact", "table"))
+        checks.count(self, "angles", 4)
+        checks.count(self, "max_skip")
+        checks.within(self, "max_skip", 1, 255, "give 1 to 255 cells")
+        checks.not_negative(self, "surface")
 
 
 @jax.tree_util.register_dataclass

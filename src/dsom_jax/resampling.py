@@ -29,7 +29,7 @@ def pick_in_rows(cumulative: Array, rows: Array, positions: Array) -> Array:
     """
     width = cumulative.shape[1]
     flat, first = cumulative.reshape(-1), rows * width
-    total = flat[first + width - 1]
+    total = flat[first + width - 1].astype(positions.dtype)
     scaled = jnp.minimum(positions * total, jnp.nextafter(total, jnp.zeros_like(total)))
     found = jnp.zeros_like(rows)
     for step in (2**power for power in reversed(range(width.bit_length()))):

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import jax.numpy as jnp
 
+from dsom_jax import checks
 from dsom_jax.geometry import transform_points
 from dsom_jax.lidar import LidarConfig, scan_points
 from dsom_jax.occupancy import OccupancyGrid, euclidean_distance
@@ -32,6 +33,11 @@ class ScoreModel:
     beta: float = 0.1
     range_max: float = 10.0
     power: int = 3
+
+    def __post_init__(self) -> None:
+        checks.positive(self, "sigma range_max")
+        checks.not_negative(self, "alpha beta")
+        checks.count(self, "power")
 
 
 def valid_beams(ranges: Array) -> Array:
@@ -79,10 +85,9 @@ class BeamModel:
     range_max: float = 10.0
 
     def __post_init__(self) -> None:
-        if abs(self.z_hit + self.z_short + self.z_max + self.z_rand - 1) > 1e-6:
-            raise ValueError("BeamModel: z_hit + z_short + z_max + z_rand must be 1")
-        if self.sigma_hit <= 0 or self.temper <= 0:
-            raise ValueError("BeamModel: sigma_hit and temper must be positive")
+        checks.share(self, "z_hit z_short z_max z_rand")
+        checks.sum_to_one(self, "z_hit z_short z_max z_rand")
+        checks.positive(self, "sigma_hit temper range_max")
 
 
 def beam_log_terms(ranges: Array, expected: Array, model: BeamModel) -> Array:
@@ -120,6 +125,11 @@ class LikelihoodField:
     max_distance: float = 2.0
     temper: float = 0.25
     range_max: float = 10.0
+
+    def __post_init__(self) -> None:
+        checks.share(self, "z_hit z_rand")
+        checks.sum_to_one(self, "z_hit z_rand")
+        checks.positive(self, "sigma_hit max_distance temper range_max")
 
 
 def distance_field(grid: OccupancyGrid, model: LikelihoodField) -> Array:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+import math
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -66,8 +67,19 @@ class Arguments:
     def __post_init__(self) -> None:
         if self.steps is not None and self.steps < 1:
             raise UserError(f"--steps {self.steps}: give at least one step")
-        if self.steps is None and not self.minutes > 0:
+        if self.steps is None and not 0 < self.minutes < math.inf:
             raise UserError(f"--minutes {self.minutes}: give a positive time")
+        if not self.save_minutes > 0:
+            raise UserError(f"--save-minutes {self.save_minutes}: give a positive time")
+        if self.save_steps is not None and self.save_steps < 1:
+            raise UserError(f"--save-steps {self.save_steps}: give at least one step")
+
+
+class Material(NamedTuple):
+    """What a run reads before it begins: maps at the network's resolution, and the network to start from, if any."""
+
+    grids: list[OccupancyGrid]
+    network: DSOM | None
 
 
 def read_config(path: Path | None) -> TrainConfig:
@@ -92,24 +104,32 @@ def load_maps(paths: tuple[Path, ...], resolution: float) -> list[OccupancyGrid]
     return grids
 
 
-def open_run(args: Arguments) -> Run:
-    """A new run in an empty folder, or the one to resume."""
+def open_run(args: Arguments) -> tuple[Run, Material]:
+    """A new run in an empty folder, or the one to resume, and what it is made of."""
     path = args.out / "run.json"
     if args.resume and path.exists():
-        return resume_run(args, path)
+        run = resume_run(args, path)
+        return run, read_material(args, run)
+    if args.out.exists() and not args.out.is_dir():
+        raise UserError(f"--out {args.out}: is a file; give a folder")
     if not args.resume and args.out.exists() and any(args.out.iterdir()):
         raise UserError(f"{args.out}: not empty; add --resume to continue that run, or give another --out")
     begin = None if args.init is None else args.init.name
     run = Run(args.out, read_config(args.config), tuple(str(p) for p in args.maps), args.steps, init=begin)
-    # Read once before anything is written: a bad map or checkpoint leaves no folder behind.
-    load_maps(args.maps, run.config.model.resolution)
-    load_init(args.init, run.config)
+    # Before anything is written: a bad map or checkpoint leaves no folder behind.
+    material = read_material(args, run)
     try:
         args.out.mkdir(parents=True, exist_ok=True)
         run.write()
     except OSError as error:
         raise UserError(f"{args.out}: cannot write ({error.strerror}); give another --out") from error
-    return run
+    return run, material
+
+
+def read_material(args: Arguments, run: Run) -> Material:
+    """Maps and network; a run that has saved a state no longer needs the network that it began with."""
+    network = None if run.states() else load_init(args.init, run.config)
+    return Material(load_maps(tuple(map(Path, run.maps)), run.config.model.resolution), network)
 
 
 def resume_run(args: Arguments, path: Path) -> Run:
@@ -120,6 +140,8 @@ def resume_run(args: Arguments, path: Path) -> Run:
         run = Run(args.out, config, tuple(record["maps"]), record["total"], record["seconds"], record.get("init"))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(f"{path}: no run to resume here ({error}); start without --resume") from error
+    if args.maps and tuple(map(str, args.maps)) != run.maps:
+        raise UserError(f"--maps: the run in {path} has {', '.join(run.maps) or 'none'}; resume without --maps")
     if args.config is not None and read_config(args.config) != config:
         raise UserError(f"{args.config}: differs from the run in {path}; resume without --config")
     if args.steps is not None and run.total is not None and args.steps != run.total:
@@ -127,11 +149,11 @@ def resume_run(args: Arguments, path: Path) -> Run:
     return run
 
 
-def first_state(args: Arguments, run: Run) -> TrainState:
+def first_state(run: Run, network: DSOM | None) -> TrainState:
     """The newest saved state, or a fresh one."""
     if run.states():
         return checkpoint.load_state(run.states()[-1], init_state(run.config))
-    return init_state(run.config, load_init(args.init, run.config))
+    return init_state(run.config, network)
 
 
 def load_init(path: Path | None, config: TrainConfig) -> DSOM | None:
@@ -140,7 +162,9 @@ def load_init(path: Path | None, config: TrainConfig) -> DSOM | None:
         return None
     model: DSOM = checkpoint.load(path)
     if model.config != config.model:
-        raise UserError(f"{path}: field model is {model.config}, the run's is {config.model}; make them equal")
+        pairs = [(f.name, getattr(model.config, f.name), getattr(config.model, f.name)) for f in fields(config.model)]
+        unlike = ", ".join(f"{name} = {own!r}, the run's is {wanted!r}" for name, own, wanted in pairs if own != wanted)
+        raise UserError(f"{path}: field model: {unlike}; give a --config with the network's own, or another --init")
     return model
 
 
@@ -156,15 +180,14 @@ def held_out(run: Run, grids: list[OccupancyGrid]) -> Any:
 class Trainer:
     """The Python loop around the jitted step."""
 
-    def __init__(self, args: Arguments, run: Run) -> None:
+    def __init__(self, args: Arguments, run: Run, material: Material) -> None:
         self.args, self.run = args, run
-        grids = load_maps(tuple(Path(m) for m in run.maps), run.config.model.resolution) if run.maps else []
         self.mesh = data_mesh()
-        make = make_batches(run.config, grids)
+        make = make_batches(run.config, material.grids)
         self.batches = lambda step, total: spread(make(step, total), self.mesh)
         self.step = make_step(run.config)
-        self.evaluate = held_out(run, grids)
-        self.state = replicate(first_state(args, run), self.mesh)
+        self.evaluate = held_out(run, material.grids)
+        self.state = replicate(first_state(run, material.network), self.mesh)
         self.saved_at = time.monotonic()
         self.clock = time.monotonic()
         trim_log(run.out / "metrics.jsonl", int(self.state.step))
@@ -232,10 +255,10 @@ def main() -> None:
     """Entry point."""
     args = parse(Arguments, "python -m dsom_jax.train")
     keep_freed_memory()
-    run = open_run(args)
+    run, material = open_run(args)
     columns = (TextColumn("{task.completed} / {task.total}"), BarColumn(), TextColumn("{task.fields[note]}"))
     with Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn()) as progress:
-        Trainer(args, run).train(progress)
+        Trainer(args, run, material).train(progress)
 
 
 if __name__ == "__main__":

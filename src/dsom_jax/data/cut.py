@@ -67,6 +67,16 @@ def segment_indices(
     return used[starts[:, None] + np.arange(length)]
 
 
+def refuse_repeats(log: RawLog, rows: np.ndarray) -> None:
+    """UserError if two of the segments (S, T) are the same, which would count one drive several times."""
+    different = len(np.unique(rows[:, 0]))
+    if different < len(rows):
+        raise UserError(
+            f"{log.path}: has only {different} different segments of {rows.shape[1]} updates, --segments {len(rows)} "
+            "asks for more; give fewer --segments or a smaller --steps-per-segment"
+        )
+
+
 def segments(
     log: RawLog,
     count: int,

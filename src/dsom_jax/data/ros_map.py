@@ -74,6 +74,8 @@ def read_map_info(path: str | Path) -> MapInfo:
     resolution = _number(path, fields, "resolution")
     if not (resolution > 0 and math.isfinite(resolution)):
         raise UserError(f"{path}: resolution = {resolution}: must be a positive number of metres per pixel")
+    if not 1e-3 <= resolution <= 10:
+        raise UserError(f"{path}: resolution = {resolution}: not metres per pixel of a building; give 0.001 to 10")
     occupied, free = _number(path, fields, "occupied_thresh"), _number(path, fields, "free_thresh")
     if not 0 <= free < occupied <= 1:
         raise UserError(

@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 
+from dsom_jax import checks
 from dsom_jax.filters.common import Info, ParticleState
 from dsom_jax.filters.updates import SharedProposal, mixture_update
 from dsom_jax.types import Array, Inputs, Key
@@ -22,6 +23,9 @@ class AdamMCL(SharedProposal):
     """
 
     t_cut: float = field(default=0.6, metadata={"static": True})
+
+    def __post_init__(self) -> None:
+        checks.share(self, "t_cut")
 
     def step(self, key: Key, state: ParticleState, inputs: Inputs, prepared: Any) -> tuple[ParticleState, Info]:
         """One update; all of the first is MCL."""

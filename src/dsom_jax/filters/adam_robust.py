@@ -19,8 +19,10 @@ import jax
 import jax.numpy as jnp
 from jax.scipy.special import logsumexp
 
+from dsom_jax import checks
 from dsom_jax.filters.common import Info, describe
 from dsom_jax.lidar import LidarConfig
+from dsom_jax.occupancy import is_free
 from dsom_jax.proposals.uniform import FreeSpace
 from dsom_jax.raycast import MapTables, cast_rays
 from dsom_jax.resampling import pick
@@ -53,12 +55,11 @@ class RobustConfig:
     model: BeamModel = BeamModel()
 
     def __post_init__(self) -> None:
-        if self.particles < 1:
-            raise ValueError(f"particles = {self.particles}: give at least one")
-        if not 0 < self.kidnap < 1 or not 0 < self.low_min <= self.low_max < 1 or not 0 <= self.flatten < 1:
-            raise ValueError("RobustConfig: kidnap, low_min <= low_max and flatten are shares between 0 and 1")
-        if not 0 <= self.caution < 1:
-            raise ValueError(f"RobustConfig.caution = {self.caution}: give a share below one")
+        checks.count(self, "particles")
+        checks.share(self, "kidnap low_min low_max", excluding="()")
+        checks.share(self, "flatten caution", excluding=")")
+        if self.low_min > self.low_max:
+            raise ValueError(checks.message(self, "low_min", f"must not exceed low_max = {self.low_max!r}"))
 
 
 class RobustState(NamedTuple):
@@ -153,7 +154,9 @@ class AdamRobust:
         """L: draw from q; the whole mass of the prior at the first update, eps of it later."""
         poses, log_q = self.proposal.sample(key, prepared, self.config.particles)
         prior = jnp.where(state.updates == 0, 0.0, jnp.log(self.config.kidnap))
-        return Draw(poses, prior + self.space.log_density_value - log_q - jnp.log(low.sum()))
+        # u is zero where no robot can stand, whatever q thinks: cells of PM may be larger than those of the map.
+        log_u = jnp.where(is_free(self.tables.grid, poses), self.space.log_density_value, -jnp.inf)
+        return Draw(poses, prior + log_u - log_q - jnp.log(low.sum()))
 
     def _evidence(self, state: RobustState, poses: Array, inputs: Inputs) -> Array:
         """log p(z | x) (N,), tempered further while the filter is lost."""

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dsom_jax import checks
 from dsom_jax.filters.common import Info, ParticleState
 from dsom_jax.filters.updates import Draw, FilterConfig, World, mcl_update, mix, start
 from dsom_jax.types import Array, Inputs, Key
@@ -27,6 +28,9 @@ class MCL:
     world: World
     config: FilterConfig = field(metadata={"static": True})
     injection: float = field(default=0.2, metadata={"static": True})
+
+    def __post_init__(self) -> None:
+        checks.share(self, "injection")
 
     def prepare(self, inputs: Inputs) -> None:
         """Nothing is shared between particles."""

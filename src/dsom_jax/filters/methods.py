@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 import jax
 
+from dsom_jax import checks
 from dsom_jax.episode import Episode
 from dsom_jax.filters.adam import AdamMCL
 from dsom_jax.filters.adam_robust import AdamRobust, RobustConfig
@@ -80,6 +81,12 @@ class Settings:
     robust: RobustConfig = RobustConfig(model=BeamModel(0.65, 0.05, 0.05, 0.25, sigma_hit=0.1, temper=0.2))
     robust_motion: Motion = OdometryMotion(0.01, 0.01, 0.01, 0.01, 0.02, 0.015, slip=0.1, tail=0.4, tail_scale=4.0)
     robust_raycast: RaycastConfig = RaycastConfig("table")
+
+    def __post_init__(self) -> None:
+        checks.count(self, "particles max_beams")
+        checks.count(self, "seed", 0)
+        checks.share(self, "t_cut")
+        checks.positive(self, "sharpness")
 
 
 _SCANNED = 1.0

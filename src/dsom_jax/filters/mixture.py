@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from dsom_jax import checks
 from dsom_jax.filters.common import Info, ParticleState
 from dsom_jax.filters.updates import SharedProposal, mixture_update
 from dsom_jax.types import Inputs, Key
@@ -23,6 +24,9 @@ class MixtureMCL(SharedProposal):
     """
 
     p: float = field(default=0.95, metadata={"static": True})
+
+    def __post_init__(self) -> None:
+        checks.share(self, "p")
 
     def step(self, key: Key, state: ParticleState, inputs: Inputs, prepared: Any) -> tuple[ParticleState, Info]:
         """One update."""

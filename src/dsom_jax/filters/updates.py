@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
 
+from dsom_jax import checks
 from dsom_jax.filters.common import Info, ParticleState, describe, normalise
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.proposals.uniform import FreeSpace
@@ -36,8 +37,9 @@ class FilterConfig:
     resampling: Resampling = "systematic"
 
     def __post_init__(self) -> None:
-        if self.particles < 1:
-            raise ValueError(f"particles = {self.particles}: give at least one")
+        checks.count(self, "particles")
+        checks.choice(self, "predecessor", get_args(Predecessor))
+        checks.choice(self, "resampling", get_args(Resampling))
 
 
 @jax.tree_util.register_dataclass

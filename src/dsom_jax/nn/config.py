@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
+from dsom_jax import checks
 from dsom_jax.lidar import LidarConfig
 
 
@@ -42,19 +43,16 @@ class DSOMConfig:
     reach_min: float = 10.0
 
     def __post_init__(self) -> None:
-        for name in ("width", "headings", "channels"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"DSOMConfig.{name} = {getattr(self, name)}: give a positive number")
-        if self.headings % 2 or self.radial_bins < 2:
-            raise ValueError("DSOMConfig: headings must be even and radial_bins at least 2")
-        if self.encoder not in ("polar", "paper"):
-            raise ValueError(f"DSOMConfig.encoder = {self.encoder!r}: choose polar or paper")
+        checks.count(self, "width headings channels")
+        checks.count(self, "radial_bins", 2)
+        if self.headings % 2:
+            raise ValueError(checks.message(self, "headings", "give an even number"))
+        checks.choice(self, "encoder", ("polar", "paper"))
         if self.encoder == "paper" and self.scan_size not in (64, 128):
             raise ValueError(f"DSOMConfig.scan_size = {self.scan_size}: 64 or 128, so that 4 x 4 cells reach the MLP")
         if self.panorama and self.encoder != "polar":
             raise ValueError("DSOMConfig.panorama needs encoder polar")
-        if not (self.resolution > 0 and self.range_max > 0):
-            raise ValueError("DSOMConfig: resolution and range_max are positive metres")
+        checks.positive(self, "resolution range_max fov_min reach_min")
 
     @property
     def depth(self) -> int:

@@ -9,6 +9,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
+from dsom_jax import checks
 from dsom_jax import pose_grid as pg
 from dsom_jax.episode import Episode
 from dsom_jax.lidar import LidarConfig, scan_points
@@ -34,6 +35,12 @@ class DualFeaturesConfig:
     obstacles: int = 20
     bandwidth: float = 0.3
     headings: int = 32
+
+    def __post_init__(self) -> None:
+        checks.count(self, "layouts headings")
+        checks.count(self, "samples", self.layouts)
+        checks.count(self, "obstacles", 0)
+        checks.positive(self, "bandwidth")
 
 
 @jax.tree_util.register_dataclass
@@ -129,8 +136,5 @@ def with_episode(proposal: DualFeatures, episode: Episode) -> DualFeatures:
 
 def flat_cells(pose_grid: pg.PoseGrid, poses: Array) -> Array:
     """(n,) int32 flat index of the cell of each map-frame pose (n, 3); beyond the last one where off the grid."""
-    known = jnp.isfinite(poses).all(-1)
-    i, j, k = (jnp.where(known, jnp.round(v), -1).astype(jnp.int32) for v in pg.pose_cell(pose_grid, poses))
-    on_grid = (i >= 0) & (i < pose_grid.height) & (j >= 0) & (j < pose_grid.width)
-    flat = (i * pose_grid.width + j) * pose_grid.headings + k % pose_grid.headings
-    return jnp.where(on_grid, flat, math.prod(pose_grid.shape))
+    i, j, k, on_grid = pg.nearest_cell(pose_grid, poses)
+    return jnp.where(on_grid, (i * pose_grid.width + j) * pose_grid.headings + k, math.prod(pose_grid.shape))

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import jax
 import jax.numpy as jnp
 
+from dsom_jax import checks
 from dsom_jax import pose_grid as pg
 from dsom_jax.geometry import compose
 from dsom_jax.proposals.dsom import DSOMProposal
@@ -29,8 +30,8 @@ class HybridConfig:
     floor: float = 0.01
 
     def __post_init__(self) -> None:
-        if self.evidence < 0 or self.network < 0 or not 0 < self.floor < 1:
-            raise ValueError("HybridConfig: evidence and network must not be negative, floor lies between 0 and 1")
+        checks.not_negative(self, "evidence network")
+        checks.share(self, "floor", excluding="()")
 
 
 @jax.tree_util.register_dataclass

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import math
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dsom_jax import checks
 from dsom_jax import pose_grid as pg
 from dsom_jax.geometry import compose
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.occupancy import OccupancyGrid, pad
 from dsom_jax.raycast import MapTables, RaycastConfig, cast_rays, make_tables
+from dsom_jax.resampling import pick_in_rows
 from dsom_jax.sensor import BeamModel, beam_log_terms
 from dsom_jax.types import Array, Inputs, Key
 
@@ -41,6 +44,10 @@ class LikelihoodGridConfig:
     raycast: RaycastConfig = RaycastConfig("exact")
     model: BeamModel = field(default_factory=lambda: BeamModel(sigma_hit=0.15, temper=0.5))
 
+    def __post_init__(self) -> None:
+        checks.positive(self, "resolution")
+        checks.count(self, "headings angles_per_heading beams")
+
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
@@ -48,11 +55,14 @@ class LikelihoodGrid:
     """Expected ranges from every free cell, and how a scan is held against them.
 
     PM lives on cells of the *sensor's* position, so that a mounting offset costs nothing; samples are base poses.
+    A cell may cover several cells of the map, not all of them free: its mass counts the free ones, and samples lie on
+    those alone. With a mounting offset that holds for the sensor; the base beside it may stand where it cannot.
 
     Attributes:
         pose_grid: (H, W, K) cells.
         free: (H, W) bool, cells with free space in them.
-        cells: (C,) int32 flat indices of those cells; H * W where there are fewer.
+        parts: (H * W, F * F) uint16 running count of the free ones among the map's cells in each cell.
+        cells: (C,) int32 flat indices of the free cells; H * W where there are fewer.
         expected: (A, C) uint16 expected ranges in 1023rds of ``model.range_max``, 1023 = no return.
         lidar: geometry of the whole scan (static).
         config: static.
@@ -60,17 +70,19 @@ class LikelihoodGrid:
 
     pose_grid: pg.PoseGrid
     free: Array
+    parts: Array
     cells: Array
     expected: Array
     lidar: LidarConfig = field(metadata={"static": True})
     config: LikelihoodGridConfig = field(metadata={"static": True})
 
     def prepare(self, inputs: Inputs) -> pg.ProbabilityMap:
-        """PM of one scan (B,): softmax of the tempered log-likelihood over all free cells."""
+        """PM of one scan (B,): the tempered likelihood, normalised over free space."""
         return self.probability_map(self.log_likelihood(inputs.ranges))
 
     def probability_map(self, log_mass: Array) -> pg.ProbabilityMap:
-        """PM of unnormalised logarithms (C, K) at the free cells."""
+        """PM of unnormalised log densities (C, K) at the free cells."""
+        log_mass += jnp.log(self.parts[self.cells, -1] / self.parts.shape[1])[:, None]
         full = jnp.full((self.free.size, self.config.headings), -jnp.inf).at[self.cells].set(log_mass, mode="drop")
         return pg.from_log(self.pose_grid, full.reshape(self.pose_grid.shape), self.free)
 
@@ -82,10 +94,39 @@ class LikelihoodGrid:
         return self.config.model.temper * _sum_terms(self.expected, table, columns)
 
     def sample(self, key: Key, prepared: pg.ProbabilityMap, n: int) -> tuple[Array, Array]:
-        """``n`` base poses (n, 3) from PM and their log densities."""
-        poses, log_density = pg.sample(key, prepared, n)
+        """``n`` base poses (n, 3) from PM, uniform within the free space of a cell, and their log densities."""
+        u = jax.random.uniform(key, (5, n))
+        cell, k = pg.pick_cells(prepared, u[:2])
+        # One number chooses the free part, and what is left of it the place in there.
+        part = pick_in_rows(self.parts, cell, u[2])
+        along = (u[2] * self.parts[cell, -1]) % 1.0
+        side = self.map_cells.height // self.pose_grid.height
+        i, j = (v * side + w for v, w in zip(divmod(cell, self.pose_grid.width), divmod(part, side), strict=True))
+        poses = pg.cell_pose(self.map_cells, i + along - 0.5, j + u[3] - 0.5, k + u[4] - 0.5)
         x, y, _ = self.lidar.mount
-        return compose(poses, jnp.array([-x, -y, 0.0])), log_density
+        return compose(poses, jnp.array([-x, -y, 0.0])), self._log_density(prepared, cell, k)
+
+    def log_density(self, prepared: pg.ProbabilityMap, poses: Array) -> Array:
+        """Log density (...) of :meth:`sample` at base poses (..., 3) in 1 / (m^2 rad); -inf off free space."""
+        x, y, _ = self.lidar.mount
+        i, j, k, on_grid = pg.nearest_cell(self.map_cells, compose(poses, jnp.array([x, y, 0.0])))
+        side = self.map_cells.height // self.pose_grid.height
+        cell = jnp.where(on_grid, i // side * self.pose_grid.width + j // side, 0)
+        part = i % side * side + j % side
+        before = jnp.where(part > 0, self.parts[cell, part - 1], 0)
+        free = on_grid & (self.parts[cell, part] > before)
+        return jnp.where(free, self._log_density(prepared, cell, k), -jnp.inf)
+
+    def _log_density(self, prepared: pg.ProbabilityMap, cell: Array, k: Array) -> Array:
+        """Log density on the free parts of cells (flat (i, j), k)."""
+        volume = jnp.log(self.parts[cell, -1].astype(jnp.float32)) + self.map_cells.log_cell_volume
+        return pg.log_share(prepared, cell, k) - volume
+
+    @property
+    def map_cells(self) -> pg.PoseGrid:
+        """The cells of PM divided into those of the map."""
+        side, grid = math.isqrt(self.parts.shape[1]), self.pose_grid
+        return replace(grid, height=grid.height * side, width=grid.width * side, resolution=grid.resolution / side)
 
 
 def likelihood_grid(grid: OccupancyGrid, lidar: LidarConfig, config: LikelihoodGridConfig) -> LikelihoodGrid:
@@ -96,8 +137,10 @@ def likelihood_grid(grid: OccupancyGrid, lidar: LidarConfig, config: LikelihoodG
     cells = jnp.flatnonzero(coarse.free, size=count, fill_value=coarse.free.size).astype(jnp.int32)
     tables = make_tables(grid, config.raycast, config.model.range_max)
     angles = config.headings * config.angles_per_heading
-    expected = _expected(tables, _viewpoints(grid, coarse, cells), angles, config.model.range_max)
-    return LikelihoodGrid(pose_grid, coarse.free, cells, expected, lidar, config)
+    blocks = free_blocks(grid, coarse)
+    expected = _expected(tables, _viewpoints(grid, coarse, blocks, cells), angles, config.model.range_max)
+    parts = jnp.cumsum(blocks.reshape(len(blocks), -1), -1, dtype=jnp.uint16)
+    return LikelihoodGrid(pose_grid, coarse.free, parts, cells, expected, lidar, config)
 
 
 @partial(jax.jit, static_argnames="resolution")
@@ -111,12 +154,18 @@ def resample_free(grid: OccupancyGrid, resolution: float) -> OccupancyGrid:
 
 
 @jax.jit
-def _viewpoints(grid: OccupancyGrid, coarse: OccupancyGrid, cells: Array) -> Array:
-    """(C, 2) metres in the grid's frame: centre of the free old cell nearest to the centre of each new cell."""
+def free_blocks(grid: OccupancyGrid, coarse: OccupancyGrid) -> Array:
+    """(H * W, F, F) bool, the free ones among the F x F old cells in each new cell."""
     factor = round(coarse.resolution / grid.resolution)
     rows, cols = coarse.shape
     free = pad(grid, (rows * factor, cols * factor)).free
-    blocks = free.reshape(rows, factor, cols, factor).swapaxes(1, 2).reshape(rows * cols, factor, factor)
+    return free.reshape(rows, factor, cols, factor).swapaxes(1, 2).reshape(rows * cols, factor, factor)
+
+
+@jax.jit
+def _viewpoints(grid: OccupancyGrid, coarse: OccupancyGrid, blocks: Array, cells: Array) -> Array:
+    """(C, 2) metres in the grid's frame: centre of the free old cell nearest to the centre of each new cell."""
+    factor, cols = blocks.shape[1], coarse.shape[1]
     offset = jnp.arange(factor) - (factor - 1) / 2
     far = jnp.where(blocks[cells], offset[:, None] ** 2 + offset**2, jnp.inf).reshape(len(cells), -1)
     best = jnp.argmin(far, -1)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import ndimage
 
+from dsom_jax import checks
 from dsom_jax.episode import Episode
 from dsom_jax.errors import UserError
 from dsom_jax.geometry import relative
@@ -63,10 +64,9 @@ class DriveConfig:
     def __post_init__(self) -> None:
         if not self.updates or min(self.updates) < 2:
             raise ValueError(f"DriveConfig.updates = {self.updates}: each phase needs at least 2 updates")
-        if min(self.update_min_d, self.update_min_a) <= 0:
-            raise ValueError("DriveConfig: update_min_d and update_min_a must be positive")
-        if min(self.obstacles, self.removed) < 0:
-            raise ValueError("DriveConfig: obstacles and removed cannot be negative")
+        checks.positive(self, "update_min_d update_min_a")
+        checks.count(self, "obstacles removed", 0)
+        checks.not_negative(self, "kidnap_distance near margin")
 
 
 def make_synthetic(

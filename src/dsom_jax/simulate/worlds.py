@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 
+from dsom_jax import checks
 from dsom_jax.occupancy import OccupancyGrid, from_cells
 from dsom_jax.simulate.floorplan import Style, building_frame, room_labels
 from dsom_jax.simulate.furnish import furnish
@@ -61,10 +62,13 @@ class WorldConfig:
     shelves: float = 0.35
 
     def __post_init__(self) -> None:
-        if self.cells < 32:
-            raise ValueError(f"WorldConfig.cells = {self.cells}: a building needs at least 32 x 32 cells")
-        if not 0.05 <= self.resolution <= 0.5:
-            raise ValueError(f"WorldConfig.resolution = {self.resolution}: give 0.05 to 0.5 metres per cell")
+        checks.count(self, "cells", 32)
+        checks.within(self, "resolution", 0.05, 0.5, "give 0.05 to 0.5 metres per cell")
+        checks.interval(self, "room_size corridor_width door_width", 0.0)
+        checks.share(self, "hall void merge slanted curved rotated symmetric notched thick furniture pillars shelves")
+        levels = self.corridors
+        if not (len(levels) == 4 and all(p >= 0 for p in levels) and abs(sum(levels) - 1) < 1e-6):
+            raise ValueError(checks.message(self, "corridors", "give four probabilities that sum to one"))
         if self.room_size[0] < 4 * self.resolution or self.corridor_width[0] < 4 * self.resolution:
             raise ValueError("WorldConfig: rooms and corridors need at least 4 cells; use finer cells")
 

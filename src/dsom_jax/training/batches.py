@@ -10,6 +10,7 @@ from typing import NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 
+from dsom_jax import checks
 from dsom_jax.lidar import LidarConfig, LidarNoise, observe
 from dsom_jax.nn.polar import Conditions
 from dsom_jax.occupancy import OccupancyGrid
@@ -66,6 +67,16 @@ class ScanConfig:
     depth: tuple[float, float] = (-0.1, 0.35)
     deep: float = 0.5
     bare: float = 0.2
+
+    def __post_init__(self) -> None:
+        checks.count(self, "beams thinning")
+        checks.positive(self, "range_max reach_min fov_min")
+        checks.within(self, "reach_min", 0, self.range_max, f"must not exceed range_max = {self.range_max!r} m")
+        checks.within(self, "fov_min", 0, 2 * math.pi + 1e-6, "give radians, at most a full turn")
+        checks.not_negative(self, "sigma")
+        checks.share(self, "limited dropout short deep bare")
+        checks.interval(self, "obstacles", 0)
+        checks.interval(self, "depth")
 
     @property
     def lidar(self) -> LidarConfig:

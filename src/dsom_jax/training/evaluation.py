@@ -10,12 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dsom_jax.compiling import training_options
 from dsom_jax.geometry import wrap_angle
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.nn import DSOM, encode_map
 from dsom_jax.nn.dsom import masked_log_softmax, one_scan
 from dsom_jax.training.batches import Batch
-from dsom_jax.training.loop import compiler_options
 from dsom_jax.types import Array
 
 MASS_POSITION, MASS_HEADING = 1.0, float(np.deg2rad(15))
@@ -77,5 +77,5 @@ def summarise(score: Score) -> dict[str, float]:
 
 def make_evaluation(batch: Batch, lidar: LidarConfig) -> Callable[[DSOM], dict[str, float]]:
     """Compiled scoring of evaluation views on a fixed batch."""
-    score = jax.jit(score_batch, static_argnums=2, compiler_options=compiler_options())
+    score = jax.jit(score_batch, static_argnums=2, compiler_options=training_options())
     return lambda model: summarise(score(model, batch, lidar))

@@ -12,6 +12,8 @@ import jax.numpy as jnp
 import optax
 from flax import nnx
 
+from dsom_jax import checks
+from dsom_jax.compiling import training_options
 from dsom_jax.nn import DSOM, DSOMConfig, create
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.simulate.worlds import WorldConfig
@@ -45,8 +47,9 @@ class StageConfig:
     scans: int = 16
 
     def __post_init__(self) -> None:
-        if self.cells % 8 or min(self.cells, self.worlds, self.scans) < 1:
-            raise ValueError(f"StageConfig: cells = {self.cells} must be a multiple of 8, worlds and scans positive")
+        checks.count(self, "cells worlds scans")
+        if self.cells % 8:
+            raise ValueError(checks.message(self, "cells", "give a multiple of 8"))
 
 
 def _default_model() -> DSOMConfig:
@@ -91,8 +94,11 @@ class TrainConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.maps_share <= 1.0:
-            raise ValueError(f"TrainConfig.maps_share = {self.maps_share}: give a share between 0 and 1")
+        checks.share(self, "maps_share late_share")
+        checks.share(self, "ema", excluding=")")
+        checks.positive(self, "learning_rate clip blur")
+        checks.not_negative(self, "similarity_weight")
+        checks.count(self, "warmup seed", 0)
         if self.model.fov_min < self.scan.fov_min - 1e-6 or self.model.reach_min < self.scan.reach_min - 1e-6:
             raise ValueError("TrainConfig: model.fov_min and model.reach_min promise scans that scan.* does not draw")
 
@@ -179,14 +185,7 @@ def make_step(config: TrainConfig) -> Callable[[TrainState, Batch, Array], tuple
         metrics = {**losses._asdict(), "rate": rate, "gradient": optax.global_norm(gradient)}
         return TrainState(state.step + 1, params, stats, moments, average), metrics
 
-    return jax.jit(step, donate_argnums=0, compiler_options=compiler_options())
-
-
-def compiler_options() -> dict[str, str]:
-    """YNNPACK's convolutions and products use one thread; XLA's own use all. What is left to it are the reductions."""
-    if jax.default_backend() != "cpu":
-        return {}
-    return {"xla_cpu_experimental_ynn_fusion_type": "LIBRARY_FUSION_TYPE_REDUCE"}
+    return jax.jit(step, donate_argnums=0, compiler_options=training_options())
 
 
 def world_source(config: TrainConfig, stage: StageConfig, grids: list[OccupancyGrid] | None = None) -> WorldSource:

@@ -28,7 +28,9 @@ def override(config: Any, given: Any, where: str) -> Any:
 def convert(old: Any, value: Any, where: str) -> Any:
     """``value`` as the type of ``old``: numbers, text, booleans and tuples of numbers."""
     if isinstance(old, tuple) and isinstance(value, list):
-        return tuple(value)
+        if len(value) != len(old):
+            raise UserError(f"{where}: expected {len(old)} values like {list(old)!r}, got {value!r}")
+        return tuple(convert(a, b, where) for a, b in zip(old, value, strict=True))
     if isinstance(old, float) and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     if type(old) is not type(value):

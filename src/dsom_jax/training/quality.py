@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import cache
 from typing import Any, NamedTuple
 
 import jax
@@ -10,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dsom_jax import pose_grid as pg
+from dsom_jax.compiling import run_options
 from dsom_jax.geometry import wrap_angle
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.training import evaluation
@@ -91,18 +94,30 @@ def even(grid: OccupancyGrid, headings: int = 32) -> pg.ProbabilityMap:
     return pg.from_log(pg.over(grid, headings), jnp.zeros((*grid.shape, headings)), grid.free)
 
 
-@jax.jit
 def prepare(proposal: Proposal, ranges: Array) -> Any:
-    """PM of one scan (B,) at rest."""
+    """PM of one scan (B,) at rest, compiled as for a filter."""
+    return _compiled(_prepare)(proposal, ranges)
+
+
+def judge(proposal: Proposal, grid: OccupancyGrid, ranges: Array, poses: Array) -> Quality:
+    """Quality (S,) for scans (S, B) at map-frame poses (S, 3), one after the other; no PM counts as uniform."""
+    return _compiled(_judge)(proposal, grid, ranges, poses)
+
+
+@cache
+def _compiled(function: Callable[..., Any]) -> Any:
+    """Compiler options are asked for once there is a backend, not on import."""
+    return jax.jit(function, compiler_options=run_options())
+
+
+def _prepare(proposal: Proposal, ranges: Array) -> Any:
     return proposal.prepare(Inputs(ranges, jnp.zeros(3), jnp.int32(0)))
 
 
-@jax.jit
-def judge(proposal: Proposal, grid: OccupancyGrid, ranges: Array, poses: Array) -> Quality:
-    """Quality (S,) for scans (S, B) at map-frame poses (S, 3), one after the other; no PM counts as uniform."""
+def _judge(proposal: Proposal, grid: OccupancyGrid, ranges: Array, poses: Array) -> Quality:
 
     def one(scan: tuple[Array, Array]) -> Quality:
-        pm = proposal.prepare(Inputs(scan[0], jnp.zeros(3), jnp.int32(0)))
+        pm = _prepare(proposal, scan[0])
         if pm is None:
             return quality(even(grid), grid.free, scan[1])
         return quality(pm, getattr(proposal, "free", grid.free), scan[1])
