@@ -16,7 +16,7 @@ from rich.progress import Progress
 from dsom_jax import checkpoint, metrics, report
 from dsom_jax.cli import parse
 from dsom_jax.data import RawLog, load_log, load_ros_map, save_tum
-from dsom_jax.data.cut import refuse_repeats, segment_indices, splice, to_episode
+from dsom_jax.data.cut import segment_indices, splice, to_episode, without_repeats
 from dsom_jax.episode import Episode
 from dsom_jax.errors import UserError, run_cli
 from dsom_jax.filters.methods import DRAWN, REAL, make_filter, make_proposal
@@ -159,7 +159,7 @@ def cut(log: RawLog, args: Args) -> list[Drive]:
             f"{log.path}: segments of {rows.shape[1]} updates are too short to judge, need {metrics.HOLD + 1}; "
             "give a longer log, fewer --segments or smaller --update-min-d and --update-min-a"
         )
-    refuse_repeats(log, rows)
+    rows = distinct(log, rows, args)
     pieces = [Drive(to_episode(log, row), log.stamps[row]) for row in rows]
     if not args.kidnap:
         return pieces
@@ -168,6 +168,16 @@ def cut(log: RawLog, args: Args) -> list[Drive]:
         Drive(splice(a.episode, b.episode), np.concatenate([a.stamps, b.stamps]))
         for a, b in zip(pieces, others, strict=True)
     ]
+
+
+def distinct(log: RawLog, rows: np.ndarray, args: Args) -> np.ndarray:
+    """The segments (S, T) without repetitions; says so if a short log holds fewer than were asked for."""
+    kept = without_repeats(rows)
+    if len(kept) < len(rows):
+        print(f"{log.path.name}: has only {len(kept)} different segments of {rows.shape[1]} updates, not {len(rows)}")
+    if args.kidnap and len(kept) < 2:
+        raise UserError(f"{log.path}: --kidnap joins two segments; give a longer log or a smaller --steps-per-segment")
+    return kept
 
 
 def needs_network(args: Args) -> bool:
@@ -222,7 +232,7 @@ def summarize(outcomes: list[Outcome], grid: OccupancyGrid, args: Args) -> dict[
     head = {
         "map": str(args.map), "log": str(args.log), "map_kind": args.map_kind,
         "method": args.method, "proposal": args.proposal,
-        "particles": args.particles, "segments": args.segments, "runs": args.runs, "updates": updates,
+        "particles": args.particles, "segments": len(outcomes), "runs": args.runs, "updates": updates,
         "steps_per_segment": len(outcomes[0].drive.stamps), "seed": args.seed,
         "ms_per_update": 1e3 * float(np.median([o.seconds / len(o.drive.stamps) for o in timed])),
         "confident": float(np.mean([np.asarray(o.result.info.lost) < metrics.CONFIDENT for o in outcomes])),

@@ -19,7 +19,7 @@ from jax.sharding import PartitionSpec as P
 
 from dsom_jax.compiling import run_options
 from dsom_jax.episode import Episode
-from dsom_jax.types import Array, Filter, Inputs, Key
+from dsom_jax.types import Array, Filter, Inputs, Key, Remembering
 
 
 class Result(NamedTuple):
@@ -83,15 +83,23 @@ def simulate(filter: Filter, inputs: Inputs, keep: Array | None, keys: Key) -> t
     inputs (T, ...), keys (R,); ``keep`` (K,) are updates, or None.
     """
 
-    def update(states: Any, now: Inputs) -> tuple[Any, Any]:
-        prepared = filter.prepare(now)
+    def update(carry: tuple[Any, Any], now: Inputs) -> tuple[Any, Any]:
+        memory, states = carry
+        prepared, memory = recall(filter, memory, now)
         step_keys = _fold(keys, now.index + 1)
         states, info = jax.vmap(lambda key, state: filter.step(key, state, now, prepared))(step_keys, states)
-        return states, (info, None if keep is None else jax.tree.map(lambda leaf: leaf[0], states))
+        return (memory, states), (info, None if keep is None else jax.tree.map(lambda leaf: leaf[0], states))
 
-    states, (info, shown) = jax.lax.scan(update, jax.vmap(filter.init)(_fold(keys, 0)), inputs)
+    memory = filter.begin() if isinstance(filter, Remembering) else None
+    start = jax.vmap(filter.init)(_fold(keys, 0))
+    (_, states), (info, shown) = jax.lax.scan(update, (memory, start), inputs)
     by_run = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), info)
     return by_run, states, jax.tree.map(lambda leaf: leaf[keep][None], shown)
+
+
+def recall(filter: Filter, memory: Any, now: Inputs) -> tuple[Any, Any]:
+    """What all runs share at one update, and the memory after it; None for filters that treat each scan anew."""
+    return filter.recall(memory, now) if isinstance(filter, Remembering) else (filter.prepare(now), None)
 
 
 def _fold(keys: Key, number: Array | int) -> Key:

@@ -179,7 +179,7 @@ def march(squares: Array, x: Array, y: Array, theta: Array, bearings: Array, lim
     # Without the barrier every ray computes its heading's sine and cosine again.
     fan = jax.lax.optimization_barrier(_Fan(x + 1.0, y + 1.0, *turn))
     reach = _march_fan(squares, fan, limit)
-    hit = known & (reach < limit) & ~_on_border(squares, *fan.rays(), reach)
+    hit = known & (reach < limit) & ~_on_border(squares, fan.rays(), reach)
     return jnp.where(hit, reach, jnp.inf).reshape(shape)
 
 
@@ -234,8 +234,9 @@ def _leap(squares: Array, rays: tuple[Array, Array, Array, Array], reach: Array,
     return reach, side
 
 
-def _on_border(squares: Array, x: Array, y: Array, dx: Array, dy: Array, reach: Array) -> Array:
+def _on_border(squares: Array, rays: tuple[Array, Array, Array, Array], reach: Array) -> Array:
     """Whether a ray that ended at ``reach`` ended outside of the map (not on an occupied cell)."""
+    x, y, dx, dy = rays
     height, width = squares.shape[1] - 2, squares.shape[2] - 2
     j = x - 1 + reach * dx + jnp.where(dx >= 0, _NUDGE, -_NUDGE)
     i = y - 1 + reach * dy + jnp.where(dy >= 0, _NUDGE, -_NUDGE)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 
@@ -62,4 +62,17 @@ class Filter(Protocol):
 
     def step(self, key: Key, state: Any, inputs: Inputs, prepared: Any) -> tuple[Any, Any]:
         """One update: new state and diagnostics."""
+        ...
+
+
+@runtime_checkable
+class Remembering(Protocol):
+    """What a filter has beside :class:`Filter` if the part of an update that no particle enters has a past."""
+
+    def begin(self) -> Any:
+        """Memory before the first update, one for all runs."""
+        ...
+
+    def recall(self, memory: Any, inputs: Inputs) -> tuple[Any, Any]:
+        """In place of ``prepare``: what the update needs, and the memory after it."""
         ...

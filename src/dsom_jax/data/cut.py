@@ -67,14 +67,9 @@ def segment_indices(
     return used[starts[:, None] + np.arange(length)]
 
 
-def refuse_repeats(log: RawLog, rows: np.ndarray) -> None:
-    """UserError if two of the segments (S, T) are the same, which would count one drive several times."""
-    different = len(np.unique(rows[:, 0]))
-    if different < len(rows):
-        raise UserError(
-            f"{log.path}: has only {different} different segments of {rows.shape[1]} updates, --segments {len(rows)} "
-            "asks for more; give fewer --segments or a smaller --steps-per-segment"
-        )
+def without_repeats(rows: np.ndarray) -> np.ndarray:
+    """Segments (S, T) that differ: a log shorter than S segments would count one drive several times."""
+    return rows[np.unique(rows[:, 0], return_index=True)[1]]
 
 
 def segments(

@@ -147,16 +147,22 @@ class AdamRobust:
         rank = jnp.maximum(jnp.cumsum(~low) - 1, 0)
         ancestors = pick(jnp.cumsum(jnp.exp(log_r)), (rank + jax.random.uniform(k_resample)) / count)
         poses = self.motion.sample(k_move, state.poses[ancestors], inputs.odometry)
-        log_ratio = jnp.log1p(-self.config.kidnap) + (state.log_weights - log_r)[ancestors] - jnp.log(count)
-        return Draw(poses, log_ratio)
+        return Draw(poses, self._log_kept() + (state.log_weights - log_r)[ancestors] - jnp.log(count))
 
     def _redraw(self, key: Key, state: RobustState, low: Array, prepared: Any) -> Draw:
-        """L: draw from q; the whole mass of the prior at the first update, eps of it later."""
+        """L: draw from q."""
         poses, log_q = self.proposal.sample(key, prepared, self.config.particles)
+        return Draw(poses, self._log_redrawn(state, poses, prepared) - log_q - jnp.log(low.sum()))
+
+    def _log_kept(self) -> Array:
+        """Share of the prior that H stands for: log(1 - eps)."""
+        return jnp.log1p(-self.config.kidnap)
+
+    def _log_redrawn(self, state: RobustState, poses: Array, prepared: Any) -> Array:
+        """Prior that L stands for, log(eps u(x)) (N,); at the first update it is all of it."""
         prior = jnp.where(state.updates == 0, 0.0, jnp.log(self.config.kidnap))
         # u is zero where no robot can stand, whatever q thinks: cells of PM may be larger than those of the map.
-        log_u = jnp.where(is_free(self.tables.grid, poses), self.space.log_density_value, -jnp.inf)
-        return Draw(poses, prior + log_u - log_q - jnp.log(low.sum()))
+        return prior + jnp.where(is_free(self.tables.grid, poses), self.space.log_density_value, -jnp.inf)
 
     def _evidence(self, state: RobustState, poses: Array, inputs: Inputs) -> Array:
         """log p(z | x) (N,), tempered further while the filter is lost."""

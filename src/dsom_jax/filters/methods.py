@@ -10,6 +10,7 @@ import jax
 from dsom_jax import checks
 from dsom_jax.episode import Episode
 from dsom_jax.filters.adam import AdamMCL
+from dsom_jax.filters.adam_memory import AdamMemory
 from dsom_jax.filters.adam_robust import AdamRobust, RobustConfig
 from dsom_jax.filters.mcl import MCL
 from dsom_jax.filters.mixture import MixtureMCL
@@ -20,7 +21,8 @@ from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.proposals.dsom import dsom
 from dsom_jax.proposals.dual_features import DualFeaturesConfig, dual_features, with_episode
 from dsom_jax.proposals.hybrid import Hybrid, HybridConfig
-from dsom_jax.proposals.likelihood_grid import LikelihoodGridConfig, likelihood_grid
+from dsom_jax.proposals.likelihood_grid import LikelihoodGrid, LikelihoodGridConfig, likelihood_grid
+from dsom_jax.proposals.markov_grid import MarkovGrid, MarkovGridConfig
 from dsom_jax.proposals.uniform import free_space
 from dsom_jax.raycast import RaycastConfig, make_tables
 from dsom_jax.sensor import BeamModel, ScoreModel
@@ -66,6 +68,8 @@ class Settings:
         sharpness: exponent of DSOM's PM (``experiments/dsom``).
         hybrid: weights of likelihood grid and network.
         robust, robust_motion, robust_raycast: AdaM robust; its ``particles`` are those above.
+        memory: AdaM robust with the likelihood grid as proposal remembers earlier scans on the grid.
+        markov: how that memory moves.
     """
 
     particles: int = 200
@@ -81,6 +85,8 @@ class Settings:
     robust: RobustConfig = RobustConfig(model=BeamModel(0.65, 0.05, 0.05, 0.25, sigma_hit=0.1, temper=0.2))
     robust_motion: Motion = OdometryMotion(0.01, 0.01, 0.01, 0.01, 0.02, 0.015, slip=0.1, tail=0.4, tail_scale=4.0)
     robust_raycast: RaycastConfig = RaycastConfig("table")
+    memory: bool = False
+    markov: MarkovGridConfig = MarkovGridConfig()
 
     def __post_init__(self) -> None:
         checks.count(self, "particles max_beams")
@@ -174,7 +180,10 @@ def make_filter(
         model = replace(settings.robust.model, range_max=lidar.range_max)
         robust = replace(settings.robust, particles=settings.particles, model=model)
         tables = make_tables(grid, settings.robust_raycast, lidar.range_max)
-        return AdamRobust(tables, space, proposal, used, step, settings.robust_motion, robust)
+        parts = (used, step, settings.robust_motion, robust)
+        if settings.memory and isinstance(proposal, LikelihoodGrid):
+            return AdamMemory(tables, space, MarkovGrid(proposal, settings.markov), *parts)
+        return AdamRobust(tables, space, proposal, *parts)
     score = replace(settings.score, range_max=lidar.range_max)
     tables = make_tables(grid, settings.raycast, lidar.range_max)
     world = World(tables, space, used, step, settings.motion, score)

@@ -70,8 +70,8 @@ def _product_bwd(saved: tuple[Array, Array], gradient: Array) -> tuple[Array, Ar
     x, kernel = saved
     # Without the barrier XLA writes the gradient out transposed, which takes longer than the product itself.
     gradient = jax.lax.optimization_barrier(gradient)
-    rows = (v.reshape(-1, v.shape[-1]) for v in (x, gradient))
-    return gradient @ kernel.T, jax.lax.dot_general(*rows, (((0,), (0,)), ((), ())))
+    left, right = (v.reshape(-1, v.shape[-1]) for v in (x, gradient))
+    return gradient @ kernel.T, jax.lax.dot_general(left, right, (((0,), (0,)), ((), ())))
 
 
 product.defvjp(_product_fwd, _product_bwd)

@@ -1,0 +1,52 @@
+"""AdaM robust with a proposal that remembers: the whole history speaks for a redrawn place, not this scan alone.
+
+Both components now estimate the same posterior: H from the particles of the last update, L from the belief b- on the
+grid, which holds the kidnapping prior. They are averaged with the weights 1 - a and a:
+
+    H: (1 - a) p(z | x) w / (r N_H)        L: a b-(x) p(z | x) / (q(x) N_L)
+
+Particles refine what the grid is too coarse for; the grid carries the places that particles have lost.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from dsom_jax.filters.adam_robust import AdamRobust, Draw, RobustState
+from dsom_jax.proposals.markov_grid import MarkovGrid, Recollection
+from dsom_jax.types import Array, Inputs, Key
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class AdamMemory(AdamRobust):
+    """Adaptive mixture of particles and grid localization.
+
+    Attributes:
+        proposal: the likelihood grid with its belief.
+        share: a, weight of what the grid says (static).
+    """
+
+    proposal: MarkovGrid
+    share: float = field(default=0.5, metadata={"static": True})
+
+    def begin(self) -> Any:
+        """Memory before the first update."""
+        return self.proposal.begin()
+
+    def recall(self, memory: Any, inputs: Inputs) -> tuple[Recollection, Any]:
+        """The proposal for this update, and the memory after it."""
+        return self.proposal.recall(memory, inputs)
+
+    def _log_kept(self) -> Array:
+        """log(1 - a)."""
+        return jnp.log1p(-self.share)
+
+    def _log_redrawn(self, state: RobustState, poses: Array, prepared: Recollection) -> Array:
+        """log(a b-(x)); at the first update all is redrawn."""
+        share = jnp.where(state.updates == 0, 0.0, jnp.log(self.share))
+        return share + self.proposal.log_prior(prepared, poses)

@@ -1,0 +1,142 @@
+"""The likelihood grid with a memory: its motion against a slow reference, Bayes' rule, and the filter that draws from it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import tiny_world
+from dsom_jax.filters.adam_memory import AdamMemory
+from dsom_jax.filters.adam_robust import AdamRobust, RobustConfig
+from dsom_jax.geometry import wrap_angle
+from dsom_jax.montecarlo import run, run_keys
+from dsom_jax.motion import OdometryMotion
+from dsom_jax.occupancy import from_cells
+from dsom_jax.proposals.likelihood_grid import LikelihoodGridConfig, likelihood_grid
+from dsom_jax.proposals.markov_grid import MarkovGrid, MarkovGridConfig
+from dsom_jax.proposals.uniform import free_space
+from dsom_jax.raycast import RaycastConfig, make_tables
+from dsom_jax.types import Inputs
+from filters_kit import BEAM, GRID, LIDAR
+from reference import markov
+
+ROOM = np.ones((7, 9), bool)
+ROOM[1:6, 1:8] = False
+ROOM[2, 4] = True
+SMALL = LikelihoodGridConfig(resolution=0.5, headings=8, angles_per_heading=2, beams=8, model=BEAM)
+
+
+@pytest.fixture(scope="module")
+def room():
+    """Grid with memory of a room of 7 x 9 cells of 0.5 m with a pillar, turned by 0.4 rad."""
+    grid = from_cells(ROOM, resolution=0.5, origin=(3.0, -1.0, 0.4))
+    return MarkovGrid(likelihood_grid(grid, LIDAR, SMALL), MarkovGridConfig(kidnap=1e-4, slip=0.2))
+
+
+@pytest.fixture(scope="module")
+def memory():
+    return MarkovGrid(likelihood_grid(tiny_world.grid(), LIDAR, GRID))
+
+
+def dense(markov_grid, belief):
+    """(C, K) at the free cells -> (H, W, K)."""
+    likelihood = markov_grid.likelihood
+    full = np.zeros((likelihood.free.size + 1, likelihood.config.headings))
+    full[np.asarray(likelihood.cells)] = np.asarray(belief)
+    return full[:-1].reshape(likelihood.pose_grid.shape)
+
+
+@pytest.mark.parametrize("odometry", [(0.7, 0.0, 0.0), (0.33, -0.2, 0.9), (-0.6, 0.1, -2.5), (0.0, 0.0, math.pi)])
+def test_motion_against_the_slow_reference(room, odometry):
+    rng = np.random.default_rng(1)
+    belief = np.asarray(room.begin()) * rng.random(room.begin().shape)
+    moved = dense(room, room.predict(jnp.asarray(belief, jnp.float32), jnp.asarray(odometry, jnp.float32)))
+    expected = markov.predict(dense(room, belief), ~ROOM, odometry, 0.5, slip=0.2)
+    # Sums of some 30 products of float32 numbers, each with a relative error of 1e-7 times a few.
+    np.testing.assert_allclose(moved, expected, rtol=2e-5, atol=1e-6 * expected.max())
+
+
+def test_a_certain_robot_in_the_open_drives_where_its_odometry_says(memory):
+    grid = memory.likelihood.pose_grid
+    belief = np.zeros(memory.begin().shape, np.float32)
+    start = list(np.asarray(memory.likelihood.cells)).index(8 * grid.width + 8)
+    belief[start, 12] = 1.0  # heading -pi + 12 * 2 pi / 16 = pi / 2: up the rows
+    still = replace(memory, config=MarkovGridConfig(slip=0.0))
+    moved = dense(memory, still.predict(jnp.asarray(belief), jnp.array([0.6, 0.0, 0.0])))
+    i, j, k = (np.average(np.arange(n), weights=moved.sum(axes)) for n, axes in
+               zip(moved.shape, [(1, 2), (0, 2), (0, 1)], strict=True))  # fmt: skip
+    # Quadratic B-splines reproduce straight lines: the mean is exact.
+    np.testing.assert_allclose([i, j, k], [8 + 0.6 / 0.25, 8, 12], atol=1e-4)
+    rows = moved.sum((1, 2))
+    assert np.average((np.arange(len(rows)) - i) ** 2, weights=rows) == pytest.approx(0.25, abs=1e-4)
+    assert moved.sum() == pytest.approx(1.0, abs=1e-5)
+
+
+def test_an_update_is_bayes_rule(room):
+    inputs = Inputs(jnp.full(LIDAR.beams, 1.1), jnp.array([0.3, 0.0, 0.2]), jnp.int32(4))
+    rng = np.random.default_rng(0)
+    before = np.asarray(room.begin()) * rng.random(room.begin().shape)
+    before /= before.sum()
+    recollection, after = room.recall(jnp.asarray(before, jnp.float32), inputs)
+    moved = dense(room, room.predict(jnp.asarray(before, jnp.float32), inputs.odometry)).astype(np.float64)
+    prior = (1 - 1e-4) * moved / moved.sum() + 1e-4 * dense(room, room.begin())
+    likelihood = np.exp(dense(room, room.likelihood.log_likelihood(inputs.ranges)))
+    posterior = prior * likelihood
+    np.testing.assert_allclose(dense(room, after), posterior / posterior.sum(), rtol=1e-3, atol=1e-8)
+    for pm, mass in zip(recollection, (prior, posterior), strict=True):
+        np.testing.assert_allclose(
+            np.asarray(pm.mass) / float(pm.cumulative[-1]), mass / mass.sum(), rtol=1e-3, atol=1e-8
+        )
+
+
+def test_the_first_scan_is_that_of_the_likelihood_grid(memory):
+    first = jax.tree.map(lambda leaf: leaf[0], tiny_world.drive().inputs)
+    plain = memory.likelihood.prepare(first)
+    belief = memory.prepare(first).posterior
+    np.testing.assert_allclose(belief.mass / belief.cumulative[-1], plain.mass / plain.cumulative[-1], atol=1e-7)
+
+
+def test_log_prior_is_the_density_of_the_belief_before_the_scan(memory):
+    first = jax.tree.map(lambda leaf: leaf[0], tiny_world.drive().inputs)
+    prepared = memory.prepare(first)
+    poses, _ = memory.sample(jax.random.key(0), prepared, 50)
+    space = free_space(tiny_world.grid())
+    np.testing.assert_allclose(memory.log_prior(prepared, poses), space.log_density_value, atol=1e-4)
+
+
+@pytest.fixture(scope="module")
+def filters(memory):
+    grid = tiny_world.grid()
+    tables, space = make_tables(grid, RaycastConfig("table", angles=72), LIDAR.range_max), free_space(grid)
+    parts = (LIDAR, 1, OdometryMotion(), RobustConfig(particles=150, model=BEAM))
+    return AdamMemory(tables, space, memory, *parts), AdamRobust(tables, space, memory.likelihood, *parts)
+
+
+def test_the_first_update_is_that_of_adam_robust(filters):
+    episode = tiny_world.drive()
+    first = jax.tree.map(lambda leaf: leaf[:1], episode)
+    with_memory, without = (run(f, first, run_keys(0, 0, 3)) for f in filters)
+    np.testing.assert_allclose(with_memory.state.poses, without.state.poses, atol=1e-4)
+    np.testing.assert_allclose(with_memory.state.log_weights, without.state.log_weights, atol=2e-3)
+
+
+def test_it_finds_the_robot_keeps_it_and_run_r_is_the_run_alone(filters):
+    episode = tiny_world.drive()
+    keys = run_keys(3, 0, 6)
+    info = run(filters[0], episode, keys).info
+    alone = run(filters[0], episode, keys[4:5]).info
+    np.testing.assert_array_equal(np.asarray(info.cluster)[4], np.asarray(alone.cluster)[0])
+    off = np.asarray(info.cluster) - np.asarray(episode.poses)
+    near = (np.hypot(off[..., 0], off[..., 1]) < 0.5) & (np.abs(wrap_angle(off[..., 2])) < math.radians(10))
+    assert near[:, -5:].all()
+
+
+@pytest.mark.parametrize("field", ["kidnap", "slip"])
+def test_shares_are_checked(field):
+    with pytest.raises(ValueError, match=field):
+        MarkovGridConfig(**{field: 1.5})
