@@ -12,8 +12,8 @@ from typing import Any
 _PUBLIC = {
     "checkpoint": ("load", "load_provenance", "save"),
     "data": (
-        "RawLog", "load_bag", "load_carmen", "load_log", "load_ros_map", "load_tum", "save_ros_map", "save_tum",
-        "segments", "splice", "to_episode", "with_reference",
+        "Drawing", "RawLog", "load_bag", "load_carmen", "load_drawing", "load_log", "load_map", "load_rawseeds",
+        "load_ros_map", "load_tum", "save_ros_map", "save_tum", "segments", "splice", "to_episode", "with_reference",
     ),
     "data.suite": ("Suite", "load_suite", "save_suite"),
     "episode": ("Episode",),
