@@ -45,7 +45,8 @@ class Drawing:
         exclude: names of layers to leave out, together with the blocks that are inserted on them.
         start: (x, y) in the drawing's own coordinates: free is what can be reached from there. Empty: the inside.
         clearance: metres; without ``start``, a closed region is floor if it is somewhere that far from every line.
-        crop: (x_min, y_min, x_max, y_max) in the drawing's own coordinates: the part to keep; empty: all.
+        crop: (x_min, y_min, x_max, y_max) in the drawing's own coordinates: the part where the robot is; empty: all.
+        sight: metres around ``crop`` whose walls are kept, as they are seen from inside of it.
         pose: (x, y, yaw) of the drawing's frame in the map frame, metres and radians.
     """
 
@@ -56,13 +57,15 @@ class Drawing:
     start: tuple[float, ...] = ()
     clearance: float = 0.3
     crop: tuple[float, ...] = ()
+    sight: float = 10.0
     pose: tuple[float, ...] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
         if not (self.resolution > 0 and math.isfinite(self.resolution)):
             raise ValueError(f"resolution = {self.resolution}: must be a positive number of metres per cell")
-        if not (self.clearance >= 0 and math.isfinite(self.clearance)):
-            raise ValueError(f"clearance = {self.clearance}: must be metres, not negative")
+        for name in ("clearance", "sight"):
+            if not (getattr(self, name) >= 0 and math.isfinite(getattr(self, name))):
+                raise ValueError(f"{name} = {getattr(self, name)}: must be metres, not negative")
         if self.units and self.units not in UNITS:
             raise ValueError(f"units = {self.units!r}: choose one of {', '.join(UNITS)}")
         for name in ("layers", "exclude"):
@@ -229,12 +232,21 @@ def _grid(
     rows, columns = slice(None), slice(None)
     if drawing.crop:
         box = (scale * np.array(drawing.crop).reshape(2, 2) - corner) / drawing.resolution
-        low = np.clip(np.floor(box[0]), 0, occupied.shape[::-1]).astype(int)
-        high = np.clip(np.ceil(box[1]), 0, occupied.shape[::-1]).astype(int)
-        columns, rows = (slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
-        corner = corner + low * drawing.resolution
-        if not free[rows, columns].any():
+        part = np.zeros(free.shape, bool)
+        part[_cells(box, free.shape)] = True
+        free = free & part
+        if not free.any():
             raise UserError(f"{path}: crop = {list(drawing.crop)} holds no free cell; it is in the drawing's own units")
+        margin = drawing.sight / drawing.resolution
+        rows, columns = _cells(box + np.array([[-margin], [margin]]), free.shape)
+        corner = corner + drawing.resolution * np.array([columns.start, rows.start])
     x, y, yaw = se2.compose(np.array(drawing.pose, float), np.array([*corner, 0.0])).tolist()
     cells = jnp.asarray(occupied[rows, columns]), jnp.asarray(free[rows, columns])
     return from_cells(*cells, resolution=drawing.resolution, origin=(x, y, yaw))
+
+
+def _cells(box: np.ndarray, shape: tuple[int, ...]) -> tuple[slice, slice]:
+    """Rows and columns of the cells that a box (2, 2) of lower-left and upper-right corner (x, y) in cells touches."""
+    low = np.clip(np.floor(box[0]), 0, shape[::-1]).astype(int).tolist()
+    high = np.clip(np.ceil(box[1]), 0, shape[::-1]).astype(int).tolist()
+    return slice(low[1], high[1]), slice(low[0], high[0])
