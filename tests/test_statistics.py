@@ -54,9 +54,11 @@ def test_signed_rank_enumerates_all_signs(differences):
 
 
 def test_signed_rank_leaves_out_what_has_no_number_and_keeps_ties():
-    a, b = [1.0, 2.0, np.inf, np.nan, 5.0, 6.0], [1.0, 3.0, 1.0, 2.0, np.nan, 9.0]
+    a, b = [1.0, 2.0, np.inf, np.nan, 5.0, 6.0, np.inf], [1.0, 3.0, 1.0, 2.0, np.nan, 9.0, np.inf]
     test = s.signed_rank(a, b)
-    assert (test.pairs, test.ties, test.median) == (3, 1, -1.0)
+    # Differences 0, -1, inf, -3, 0: an infinite error counts as the worst, two of them as equal.
+    assert (test.pairs, test.ties, test.median) == (5, 2, 0.0)
+    assert test.p == s.signed_rank([0.0, -1, 99, -3, 0], np.zeros(5)).p
     assert s.signed_rank([1.0, 2.0], [1.0, 2.0]) == (2, 2, 0.0, 1.0)
     empty = s.signed_rank([np.nan], [1.0])
     assert empty.pairs == 0 and empty.p == 1.0 and math.isnan(empty.median)
@@ -234,6 +236,7 @@ def test_from_runs_to_a_verdict(tmp_path):
         s.value_evidence("retention", a.retention, b.retention, a.sequence, wanted="greater"),
     ])  # fmt: skip
     assert [e.status() for e in family] == ["supports", "supports", "undecided"]
+    assert s.signed_rank(a.converging_steps, b.converging_steps).pairs == (a.converged & b.converged).sum()
     assert family[1].estimate == pytest.approx(-0.1, abs=0.01) and family[1].low < -0.1 < family[1].high
     assert s.decide("a is better than b", family[:2]).outcome == "holds"
     assert s.decide(

@@ -36,6 +36,11 @@ class RunTable(NamedTuple):
         """(n,) bool."""
         return self.steps >= 0
 
+    @property
+    def converging_steps(self) -> np.ndarray:
+        """(n,) steps as numbers to compare, NaN where the run never converged."""
+        return np.where(self.converged, self.steps, np.nan)
+
     def rows(self, keep: Any) -> RunTable:
         """The rows ``keep`` (mask or indices)."""
         return RunTable(*(column[keep] for column in self))

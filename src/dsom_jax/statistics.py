@@ -36,7 +36,7 @@ class McNemar(NamedTuple):
 
 
 class SignedRank(NamedTuple):
-    """Wilcoxon's signed-rank test of a - b; ``pairs`` with two finite values, ``ties`` of them equal.
+    """Wilcoxon's signed-rank test of a - b; ``pairs`` with two values, ``ties`` of them equal.
 
     ``median`` is that of the differences; p is two-sided, 1 where nothing differs.
     """
@@ -69,10 +69,14 @@ def mcnemar(a: Any, b: Any) -> McNemar:
 def signed_rank(a: Any, b: Any) -> SignedRank:
     """Wilcoxon's signed-rank test of paired values (n,), for errors and steps; zero differences ranked (Pratt).
 
-    Pairs in which one is not finite (a run that never converged has no steps) are left out: whether a method converges
-    at all is :func:`mcnemar`'s question, and a made-up number of steps would decide the ranks.
+    Pairs in which one is NaN are left out. So are, for steps, the runs that never converged
+    (:attr:`dsom_jax.run_table.RunTable.converging_steps`): whether a method converges at all is :func:`mcnemar`'s
+    question, and a made-up number of steps would decide the ranks. An infinite error is the worst there is.
     """
-    difference = _differences(a, b)[0]
+    a, b = _paired(a, b, float)
+    kept = ~(np.isnan(a) | np.isnan(b))
+    a, b = a[kept], b[kept]
+    difference = np.subtract(a, b, where=a != b, out=np.zeros(len(a)))
     if not difference.any():
         return SignedRank(len(difference), len(difference), 0.0 if len(difference) else math.nan, 1.0)
     p = float(stats.wilcoxon(difference, zero_method="pratt").pvalue)
