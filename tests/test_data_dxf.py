@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-import ezdxf
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -15,24 +14,9 @@ from dsom_jax.data import load_map, save_ros_map, se2
 from dsom_jax.data.dxf import Drawing, load_drawing
 from dsom_jax.data.log import Report
 from dsom_jax.data.rasterize import enclosed, reachable, touched_cells
-from dsom_jax.errors import UserError
 from dsom_jax.occupancy import OccupancyGrid, is_free
+from tiny_drawing import ROOM, room, write
 from tiny_world import grid as tiny_room
-
-ROOM = [(0, 0), (6, 0), (6, 4), (0, 4)]
-
-
-def write(path, draw, units=6, version="R2010", layers=()):
-    document = ezdxf.new(version, units=units)
-    for name in layers:
-        document.layers.add(name)
-    draw(document.modelspace())
-    document.saveas(path)
-    return path
-
-
-def room(msp, points=ROOM, **attributes):
-    msp.add_lwpolyline(points, close=True, dxfattribs=attributes)
 
 
 def load(tmp_path, draw, report=None, **fields) -> OccupancyGrid:
@@ -269,59 +253,3 @@ def test_maps_of_every_kind_through_one_door(tmp_path):
     assert grid.resolution == 0.25 and free_at(grid, (2, 3), (0.5, 3)) == [True, False]
     save_ros_map(tiny_room(), tmp_path / "map.yaml")
     assert (np.asarray(load_map(tmp_path / "map.yaml").occupied) == np.asarray(tiny_room().occupied)).all()
-
-
-@pytest.mark.parametrize(
-    ("text", "fragments"),
-    [
-        ("drawing: 3", ["plan.yaml", "drawing = 3", "DXF file"]),
-        ("drawing: nowhere.dxf", ["nowhere.dxf", "no such drawing"]),
-        ("drawing: plan.dxf\nscale: 2", ["plan.yaml", "unknown field scale", "resolution"]),
-        ("drawing: plan.dxf\nresolution: 0", ["plan.yaml", "resolution = 0.0", "positive"]),
-        ("drawing: plan.dxf\nresolution: fine", ["plan.yaml", "resolution", "'fine'"]),
-        ("drawing: plan.dxf\nunits: miles", ["plan.yaml", "units = 'miles'", "mm, cm"]),
-        ("drawing: plan.dxf\nlayers: [1]", ["plan.yaml", "layers = [1]", "names"]),
-        ("drawing: plan.dxf\nlayers: [NONE]", ["plan.dxf", "nothing to draw", "Defpoints"]),
-        ("drawing: plan.dxf\nstart: [1]", ["plan.yaml", "start = [1]", "[x, y]"]),
-        ("drawing: plan.dxf\nstart: [0, 0]", ["plan.dxf", "no free cell", "start = [0, 0]"]),
-        ("drawing: plan.dxf\nstart: [99, 0]", ["plan.dxf", "start = [99, 0]", "outside"]),
-        ("drawing: plan.dxf\nclearance: -1", ["plan.yaml", "clearance = -1.0"]),
-        ("drawing: plan.dxf\nsight: -1", ["plan.yaml", "sight = -1.0"]),
-        ("drawing: plan.dxf\nclearance: 9", ["plan.dxf", "no free cell", "start"]),
-        ("drawing: plan.dxf\ncrop: [1, 2, 1, 4]", ["plan.yaml", "crop = [1, 2, 1, 4]", "x_min < x_max"]),
-        ("drawing: plan.dxf\ncrop: [50, 50, 60, 60]", ["plan.dxf", "crop = [50, 50, 60, 60]", "units"]),
-        ("drawing: plan.dxf\npose: [1, 2, true]", ["plan.yaml", "pose = [1, 2, True]", "yaw"]),
-        ("drawing: plan.dxf\nunits: km\n", ["plan.dxf", "cells", "units"]),
-        ("drawing: unitless.dxf", ["unitless.dxf", "$INSUNITS = 0", "units: m"]),
-        ("drawing: open.dxf", ["open.dxf", "no free cell", "gaps"]),
-        ("drawing: words.dxf", ["words.dxf", "not a readable DXF"]),
-        ("drawing: empty.dxf", ["empty.dxf", "is empty"]),
-        ("drawing: plan.dwg", ["plan.dwg", "DWG", "save it as DXF"]),
-        ("drawing: knot.dxf", ["knot.dxf", "block contains itself"]),
-    ],
-)
-def test_spoilt_drawings_are_one_line(tmp_path, text, fragments, capfd):
-    def knot(msp):
-        msp.doc.blocks.new("KNOT").add_blockref("KNOT", (0, 0))
-        msp.add_blockref("KNOT", (0, 0))
-
-    write(tmp_path / "plan.dxf", room)
-    write(tmp_path / "unitless.dxf", room, units=0)
-    write(tmp_path / "open.dxf", lambda m: m.add_lwpolyline(ROOM))
-    write(tmp_path / "knot.dxf", knot)
-    (tmp_path / "words.dxf").write_text("to be or\nnot to be\n")
-    (tmp_path / "empty.dxf").touch()
-    (tmp_path / "plan.dwg").write_bytes(b"AC1027" + bytes(100))
-    (tmp_path / "plan.yaml").write_text(text)
-    capfd.readouterr()
-    with pytest.raises(UserError) as error:
-        load_map(tmp_path / "plan.yaml")
-    assert all(fragment in str(error.value) for fragment in fragments), error.value
-    assert "\n" not in str(error.value) and capfd.readouterr() == ("", "")
-
-
-def test_without_ezdxf_the_extra_is_named(tmp_path, monkeypatch):
-    path = write(tmp_path / "plan.dxf", room)
-    monkeypatch.setitem(__import__("sys").modules, "ezdxf", None)
-    with pytest.raises(UserError, match=r"dsom-jax\[drawings\]"):
-        load_map(path)

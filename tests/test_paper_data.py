@@ -289,3 +289,5 @@ def test_spoilt_configurations(upo, tmp_path, changes, fragments):
     with pytest.raises(UserError) as error:
         script.main(script.Args(config, upo, tmp_path / "out"))
     assert all(fragment in str(error.value) for fragment in fragments), error.value
+    # Nothing is written before the configuration and the logs are known to be good.
+    assert (tmp_path / "out").exists() == ("maps" in changes or "updates" in changes)

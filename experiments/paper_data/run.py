@@ -225,8 +225,8 @@ def main(args: Args | None = None) -> None:
     plan = read_plan(args)
     if not args.data.is_dir():
         raise UserError(f"--data {args.data}: no such folder")
-    out = report.output_folder(args.out or HERE / "results" / plan.name)
     logs = list(read_logs(plan, args.data))
+    out = report.output_folder(args.out or HERE / "results" / plan.name)
     for name, fields in plan.maps.items():
         map_yaml = write_map(name, fields, args.data, out)
         suite = choose(plan, logs, name, load_map(map_yaml))
