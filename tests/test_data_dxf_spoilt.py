@@ -30,7 +30,7 @@ from tiny_drawing import ROOM, room, write
         ("drawing: plan.dxf\nclearance: 9", ["plan.dxf", "no free cell", "start"]),
         ("drawing: plan.dxf\ncrop: [1, 2, 1, 4]", ["plan.yaml", "crop = [1, 2, 1, 4]", "x_min < x_max"]),
         ("drawing: plan.dxf\ncrop: [50, 50, 60, 60]", ["plan.dxf", "crop = [50, 50, 60, 60]", "units"]),
-        ("drawing: plan.dxf\npose: [1, 2, true]", ["plan.yaml", "pose = [1, 2, True]", "yaw"]),
+        ("drawing: plan.dxf\npose: [1, 2, true]", ["plan.yaml", "pose", "True"]),
         ("drawing: plan.dxf\nunits: km\n", ["plan.dxf", "cells", "units"]),
         ("drawing: unitless.dxf", ["unitless.dxf", "$INSUNITS = 0", "units: m"]),
         ("drawing: open.dxf", ["open.dxf", "no free cell", "gaps"]),

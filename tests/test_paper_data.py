@@ -9,6 +9,7 @@ import importlib.util
 import json
 import math
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -258,13 +259,13 @@ def test_the_pose_of_the_drawing_undoes_the_authors_transform():
 def test_training_is_called_with_words_that_it_knows(monkeypatch, tmp_path):
     called: list[list[str]] = []
     monkeypatch.setattr(script.subprocess, "run", lambda words: called.append(words) or SimpleNamespace(returncode=0))
-    plan = script.Plan(adapt_minutes=12.0)
+    plan = script.Plan(adapt_minutes=12.0, methods=("mcl", "adam_dsom"))
     folder = script.network_for(plan, tmp_path / "map.yaml", tmp_path / "start", tmp_path / "net")
     monkeypatch.setattr(sys, "argv", called[0][2:])
     arguments = parse(train.Arguments, "python -m dsom_jax.train")
     assert folder == arguments.out == tmp_path / "net" and arguments.init == tmp_path / "start"
     assert arguments.maps == (tmp_path / "map.yaml",) and arguments.minutes == 12.0
-    assert script.network_for(script.Plan(adapt_minutes=0), Path("m"), Path("start"), tmp_path) == Path("start")
+    assert script.network_for(replace(plan, adapt_minutes=0.0), Path("m"), Path("start"), tmp_path) == Path("start")
     assert script.network_for(script.Plan(methods=("mcl",)), Path("m"), None, tmp_path) is None
     monkeypatch.setattr(script.subprocess, "run", lambda words: SimpleNamespace(returncode=2))
     with pytest.raises(UserError, match=r"training on map.yaml failed"):

@@ -20,15 +20,16 @@ import tyro
 import yaml
 
 from dsom_jax import bench, checkpoint, report
+from dsom_jax.cli import progress_bar
 from dsom_jax.data import RawLog, load_log, load_map
 from dsom_jax.data.cut import splice, thin, to_episode
 from dsom_jax.data.dxf import UNITS
 from dsom_jax.data.files import read_yaml, write_atomic
+from dsom_jax.data.log import limited
 from dsom_jax.data.suite import Suite
 from dsom_jax.episode import Episode
 from dsom_jax.errors import UserError, run_cli
 from dsom_jax.filters.methods import COMBINATIONS, DRAWN, REAL, make_filter, make_proposal, needs_checkpoint
-from dsom_jax.localize import limited
 from dsom_jax.montecarlo import run_keys
 from dsom_jax.occupancy import OccupancyGrid, is_free
 from dsom_jax.proposals.dual_features import with_episode
@@ -81,7 +82,7 @@ class Plan:
     logs: tuple[str, ...] = ()
     scan_topic: str = ""
     odom_topic: str = ""
-    methods: tuple[str, ...] = ("mcl", "adam_dsom", "robust_dsom", "robust_likelihood_grid")
+    methods: tuple[str, ...] = ()
     map_kind: str = "scanned"
     particles: int = 500
     t_cut: float = 0.6
@@ -99,7 +100,8 @@ def read_plan(args: Args) -> Plan:
     plan: Plan = override(Plan(), read_yaml(args.config, "configuration"), str(args.config))
     changes = {name: getattr(args, name) for name in ("runs", "adapt_minutes") if getattr(args, name) is not None}
     unknown = [name for name in plan.methods if name not in COMBINATIONS]
-    if unknown or not plan.maps or not plan.logs or plan.map_kind not in ("scanned", "drawn"):
+    lacking = not (plan.maps and plan.logs and plan.methods)
+    if unknown or lacking or plan.map_kind not in ("scanned", "drawn"):
         raise UserError(f"{args.config}: needs maps, logs, map_kind scanned or drawn, and known methods; got {unknown}")
     if plan.clips < 2 or plan.updates < 6:
         raise UserError(f"{args.config}: give clips of at least 2 (a kidnapping joins two) and updates of at least 6")
@@ -210,7 +212,7 @@ def run_map(plan: Plan, suite: Suite, network: Any, folder: Path) -> None:
         return make_filter(algorithm, proposal, grid, suite.lidar, settings)
 
     keys = [run_keys(plan.seed, number, plan.runs) for number in range(len(suite.episodes))]
-    bar, advance = bench.progress_bar(len(plan.methods) * len(suite.episodes))
+    bar, advance = progress_bar(len(plan.methods) * len(suite.episodes))
     with bar:
         records = {name: bench.run_method(name, suite, keys, build, advance) for name in plan.methods}
     data = bench.summary(suite, records, bench.Settings(plan.runs, plan.particles, plan.t_cut, plan.seed))

@@ -10,11 +10,10 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from dsom_jax import checkpoint as networks
 from dsom_jax import metrics, plotting, report
-from dsom_jax.cli import parse
+from dsom_jax.cli import Advance, parse, progress_bar
 from dsom_jax.data.suite import Suite, load_suite
 from dsom_jax.episode import Episode
 from dsom_jax.errors import UserError, run_cli
@@ -96,7 +95,6 @@ class Record(NamedTuple):
 
 
 Build = Callable[[str, str, OccupancyGrid, Episode], Filter]
-Advance = Callable[[str, int], None]
 
 
 def benchmark(
@@ -264,20 +262,6 @@ def save(folder: Path, suite: Suite, records: dict[str, Record], data: dict[str,
         )
     for name, figure in figures.items():
         plotting.save(figure, folder / f"{name}.png")
-
-
-def progress_bar(total: int) -> tuple[Progress, Advance]:
-    """A bar on stderr over (method, sequence) pairs, and the function that moves it."""
-    bar = Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
-                   console=report.terminal(stderr=True), transient=True)  # fmt: skip
-    task = bar.add_task("starting", total=total)
-    started: list[str] = []
-
-    def advance(method: str, sequence: int) -> None:
-        bar.update(task, description=f"{method}, sequence {sequence + 1}", completed=len(started))
-        started.append(method)
-
-    return bar, advance
 
 
 def main() -> None:

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from rich.progress import Progress
 
@@ -17,10 +16,11 @@ from dsom_jax import checkpoint, metrics, report
 from dsom_jax.cli import parse
 from dsom_jax.data import RawLog, Report, load_log, load_map, save_tum
 from dsom_jax.data.cut import refuse_repeats, segment_indices, splice, to_episode
+from dsom_jax.data.log import limited
 from dsom_jax.episode import Episode
 from dsom_jax.errors import UserError, run_cli
 from dsom_jax.filters.methods import DRAWN, REAL, make_filter, make_proposal
-from dsom_jax.lidar import LidarConfig, apply_limits
+from dsom_jax.lidar import LidarConfig
 from dsom_jax.montecarlo import Result, run, run_keys
 from dsom_jax.occupancy import OccupancyGrid, is_free
 from dsom_jax.types import Filter
@@ -142,17 +142,6 @@ def check_network(args: Args) -> None:
         chosen = "--method mcl" if args.method == "mcl" else f"--proposal {args.proposal}"
         fix = "leave it out, or give --proposal dsom or hybrid and a --method other than mcl"
         raise UserError(f"--checkpoint {args.checkpoint}: has no use with {chosen}; {fix}")
-
-
-def limited(log: RawLog, range_max: float) -> RawLog:
-    """The log with readings beyond ``range_max`` metres as no return."""
-    if range_max <= log.lidar.range_min:
-        raise UserError(f"--laser-max-range {range_max}: must exceed the lidar's range_min, {log.lidar.range_min} m")
-    lidar = replace(log.lidar, range_max=min(log.lidar.range_max, range_max))
-    ranges = np.asarray(apply_limits(jnp.asarray(log.ranges), lidar))
-    if not np.isfinite(ranges).any():
-        raise UserError(f"--laser-max-range {range_max}: no reading of {log.path} is shorter; give a greater one")
-    return replace(log, lidar=lidar, ranges=ranges)
 
 
 def cut(log: RawLog, args: Args) -> list[Drive]:
