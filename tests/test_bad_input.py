@@ -156,7 +156,6 @@ def test_localize_with_spoilt_files(good, refused, tmp_path, kind):
         (("--proposal", "dsom", "--checkpoint", "net"), ["net", "does not fit the lidar", "range_max 5 m"]),
         (("--particles", "100000000000"), ["--particles 100000000000", "at most 1000000"]),
         (("--seed", "4294967296"), ["--seed 4294967296", "at most"]),
-        (("--segments", "1", "--kidnap"), ["--segments 1", "--kidnap"]),
         (("--checkpoint", "net"), ["--checkpoint net", "no use with --proposal likelihood_grid", "leave it out"]),
         (("--proposal", "dsom", "--method", "mcl", "--checkpoint", "net"), ["--checkpoint net", "--method mcl"]),
         (("--out", "room.yaml"), ["--out room.yaml", "cannot write"]),

@@ -14,11 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dsom_jax import bench
+from dsom_jax import bench, report
 from dsom_jax.episode import Episode
 from dsom_jax.errors import UserError, run_cli
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.occupancy import from_cells
+from dsom_jax.run_table import paired
 
 STEPS, MOVED = 24, 12
 M_KEYS = {
@@ -157,6 +158,27 @@ def test_command_line(suite, monkeypatch, tmp_path, capsys):
     }  # fmt: skip
 
 
+def test_per_run_values_are_those_of_the_table(suite, monkeypatch, tmp_path):
+    methods = "mcl,adam_likelihood_grid,robust_likelihood_grid"
+    command(monkeypatch, "--methods", methods, "--out", str(tmp_path), "--per-run")
+    data = json.loads((tmp_path / "bench.json").read_text())["methods"]
+    table = report.read_runs(tmp_path / "runs.npz")
+    # 3 methods x 2 phases x 3 sequences x 4 runs.
+    assert len(table.run) == 72 and (table.part == 0).all()
+    for method in methods.split(","):
+        for phase in ("global", "kidnap"):
+            rows = table.rows((table.method == method) & (table.phase == phase))
+            assert rows.sequence.tolist() == [0] * 4 + [1] * 4 + [2] * 4 and rows.run.tolist() == [0, 1, 2, 3] * 3
+            told = data[method][phase]
+            assert rows.converged.mean() == told["converged"]
+            if rows.converged.any():
+                assert rows.e_pos_m[rows.converged].mean() == pytest.approx(told["e_pos_m"])
+                assert np.median(rows.steps) == told["steps_median"] and np.nanmean(rows.retention) == told["retention"]
+    late, soon = paired(table, "adam_likelihood_grid", "robust_likelihood_grid", "kidnap")
+    # The mean of this made-up filter is 1 m beside its cluster, with the same luck.
+    np.testing.assert_allclose(late.e_pos_m - soon.e_pos_m, 1.0, atol=1e-5)
+
+
 def test_default_methods_are_those_that_can_be_run(tmp_path):
     assert "adam_dsom" not in bench.chosen_methods("", None) and "mcl" in bench.chosen_methods("", None)
     assert bench.chosen_methods("", tmp_path) == bench.STANDARD and len(bench.STANDARD) == 8
@@ -177,6 +199,7 @@ def test_default_methods_are_those_that_can_be_run(tmp_path):
         (("--methods", "robust_hybrid"), "--checkpoint"),
         (("--suite", "nowhere"), "nowhere"),
         (("--out", "FILE"), "--out"),
+        (("--per-run",), "--out"),
         (("--checkpoint", "FILE"), "FILE"),
     ],
 )

@@ -15,7 +15,7 @@ LAYERS = (
     ("types", "geometry", "errors", "checks", "compiling"),
     ("occupancy", "lidar", "raycast", "resampling", "pose_grid", "episode"),
     ("motion", "sensor", "nn", "simulate"),
-    ("proposals", "metrics"),
+    ("proposals", "metrics", "statistics", "run_table"),
     ("filters", "training", "montecarlo"),
     ("data", "checkpoint", "run_folder", "plotting", "report"),
     ("cli", "train", "bench", "localize", "evaluate"),

@@ -1,4 +1,4 @@
-"""The likelihood grid with a memory: its motion against a slow reference, Bayes' rule, and the filter that draws from it."""
+"""The likelihood grid with a memory: its motion against a slow reference, Bayes' rule, and its filter."""
 
 from __future__ import annotations
 

@@ -12,8 +12,8 @@ from typing import Any
 _PUBLIC = {
     "checkpoint": ("load", "load_provenance", "save"),
     "data": (
-        "RawLog", "load_bag", "load_carmen", "load_log", "load_ros_map", "load_tum", "save_ros_map", "save_tum",
-        "segments", "splice", "to_episode", "with_reference",
+        "Drawing", "RawLog", "load_bag", "load_carmen", "load_drawing", "load_log", "load_map", "load_rawseeds",
+        "load_ros_map", "load_tum", "save_ros_map", "save_tum", "segments", "splice", "to_episode", "with_reference",
     ),
     "data.suite": ("Suite", "load_suite", "save_suite"),
     "episode": ("Episode",),
@@ -38,6 +38,7 @@ _PUBLIC = {
     "proposals.likelihood_grid": ("LikelihoodGrid", "LikelihoodGridConfig", "likelihood_grid"),
     "proposals.uniform": ("FreeSpace", "free_space"),
     "raycast": ("MapTables", "RaycastConfig", "cast_rays", "make_tables"),
+    "run_table": ("RunTable", "paired"),
     "sensor": (
         "BeamModel", "LikelihoodField", "ScoreModel", "beam_log_likelihood", "beam_score", "field_log_likelihood",
         "perfect_score",
@@ -45,6 +46,7 @@ _PUBLIC = {
     "simulate.drive": ("DriveConfig", "make_synthetic"),
     "simulate.obstacles": ("add_obstacles", "remove_structure"),
     "simulate.worlds": ("WorldConfig", "make_world"),
+    "statistics": ("Evidence", "Verdict", "corrected", "decide", "holm", "mcnemar", "paired_difference", "signed_rank"),
     "types": ("Filter", "Inputs", "Motion", "Proposal"),
 }  # fmt: skip
 _HOME = {name: module for module, names in _PUBLIC.items() for name in names}

@@ -10,17 +10,17 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from dsom_jax import checkpoint as networks
 from dsom_jax import metrics, plotting, report
-from dsom_jax.cli import parse
+from dsom_jax.cli import Advance, parse, progress_bar
 from dsom_jax.data.suite import Suite, load_suite
 from dsom_jax.episode import Episode
 from dsom_jax.errors import UserError, run_cli
 from dsom_jax.filters.methods import METHODS, STANDARD, build_filter, needs_checkpoint
 from dsom_jax.montecarlo import Result, run, run_keys, signature
 from dsom_jax.occupancy import OccupancyGrid
+from dsom_jax.run_table import RunTable, join, run_rows
 from dsom_jax.types import Filter, Key, Proposal
 
 ESTIMATES = ("mean", "cluster")
@@ -50,6 +50,8 @@ class Args:
     """Folder for bench.json, bench.md and figures."""
     checkpoint: Path | None = None
     """Folder of a trained DSOM; default: the one in the repository."""
+    per_run: bool = False
+    """Write runs.npz, too: steps, final errors and retention of every single run, for paired comparisons."""
 
 
 @dataclass(frozen=True)
@@ -79,6 +81,7 @@ class Record(NamedTuple):
         traces: E_pos (R, T) of each sequence, metres, by the estimate that the method is judged by.
         ms_per_step: milliseconds of one update of all runs.
         compilations: how many shapes of map and episode had to be compiled.
+        table: every single run, by the estimate that the method is judged by.
         filter, result: those of the first sequence, for pictures.
     """
 
@@ -86,12 +89,12 @@ class Record(NamedTuple):
     traces: list[np.ndarray]
     ms_per_step: float
     compilations: int
+    table: RunTable
     filter: Filter
     result: Result
 
 
 Build = Callable[[str, str, OccupancyGrid, Episode], Filter]
-Advance = Callable[[str, int], None]
 
 
 def benchmark(
@@ -156,7 +159,7 @@ def check_checkpoint(args: Args, methods: Sequence[str]) -> None:
 def run_method(name: str, suite: Suite, keys: Sequence[Key], build: Build, progress: Advance | None = None) -> Record:
     """One method on all sequences."""
     parts: dict[str, dict[str, list[metrics.Runs]]] = {e: {"global": [], "kidnap": []} for e in ESTIMATES}
-    traces, clock = [], Clock()
+    traces, rows, clock = [], [], Clock()
     first: tuple[Any, ...] = ()
     filters: dict[Any, Filter] = {}
     for number, (where, grid, episode) in enumerate(suite.episodes):
@@ -168,11 +171,13 @@ def run_method(name: str, suite: Suite, keys: Sequence[Key], build: Build, progr
         for estimate, by_phase in parts.items():
             for phase, runs in judge(result, episode, estimate).items():
                 by_phase[phase] += runs
+                if estimate == judged_by(name):
+                    rows += [run_rows(name, phase, number, part, some) for part, some in enumerate(runs)]
         e_pos, _ = metrics.pose_error(getattr(result.info, judged_by(name)), episode.poses)
         traces.append(np.asarray(e_pos))
         first = first or (filter, result)
     pooled = {e: {phase: metrics.pool(runs) for phase, runs in by.items()} for e, by in parts.items()}
-    return Record(pooled, traces, clock.ms_per_step(), len(clock.compiled), *first)
+    return Record(pooled, traces, clock.ms_per_step(), len(clock.compiled), join(rows), *first)
 
 
 def judge(result: Result, episode: Episode, estimate: str) -> dict[str, list[metrics.Runs]]:
@@ -259,23 +264,11 @@ def save(folder: Path, suite: Suite, records: dict[str, Record], data: dict[str,
         plotting.save(figure, folder / f"{name}.png")
 
 
-def progress_bar(total: int) -> tuple[Progress, Advance]:
-    """A bar on stderr over (method, sequence) pairs, and the function that moves it."""
-    bar = Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
-                   console=report.terminal(stderr=True), transient=True)  # fmt: skip
-    task = bar.add_task("starting", total=total)
-    started: list[str] = []
-
-    def advance(method: str, sequence: int) -> None:
-        bar.update(task, description=f"{method}, sequence {sequence + 1}", completed=len(started))
-        started.append(method)
-
-    return bar, advance
-
-
 def main() -> None:
     """Argument handling."""
     args = parse(Args, "python -m dsom_jax.bench")
+    if args.per_run and not args.out:
+        raise UserError("--per-run: give --out, the folder for runs.npz")
     settings = Settings(args.runs, args.particles, args.t_cut, args.seed)
     checkpoint = args.checkpoint or networks.shipped()
     methods = chosen_methods(args.methods, checkpoint)
@@ -290,6 +283,8 @@ def main() -> None:
     report.print_tables(data)
     if folder:
         save(folder, suite, records, data)
+    if folder and args.per_run:
+        report.write_runs(folder / "runs.npz", join([record.table for record in records.values()]))
 
 
 if __name__ == "__main__":

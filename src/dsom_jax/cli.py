@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import io
 import re
+from collections.abc import Callable
 from contextlib import redirect_stderr
 from typing import TypeVar
 
 import tyro
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from dsom_jax import report
 from dsom_jax.errors import UserError
 
 T = TypeVar("T")
+Advance = Callable[[str, int], None]
+"""Called with a method and the number of a sequence before each drive."""
 _FRAME = re.compile(r"\x1b\[[0-9;]*m|[│╭╮╰╯]|^\s*[|+]|[|+]\s*$")
 """Frames of boxes; terminals that know ASCII only get them from | + and -."""
 
@@ -37,3 +42,17 @@ def one_line(box: str) -> str:
     sections = [part for part in re.split(r"[─-]{3,}", " ".join(row for row in rows if row)) if part.strip()] or [""]
     told = [sections[0], *(part for part in sections[1:2] if part.lstrip().startswith("Perhaps"))]
     return "; ".join(part.strip().rstrip(".:") for part in told)
+
+
+def progress_bar(total: int) -> tuple[Progress, Advance]:
+    """A bar on stderr over (method, sequence) pairs, and the function that moves it."""
+    bar = Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
+                   console=report.terminal(stderr=True), transient=True)  # fmt: skip
+    task = bar.add_task("starting", total=total)
+    started: list[str] = []
+
+    def advance(method: str, sequence: int) -> None:
+        bar.update(task, description=f"{method}, sequence {sequence + 1}", completed=len(started))
+        started.append(method)
+
+    return bar, advance

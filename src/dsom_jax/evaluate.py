@@ -17,7 +17,7 @@ from rich.table import Table
 
 from dsom_jax import checkpoint, plotting, report
 from dsom_jax.cli import parse
-from dsom_jax.data import load_ros_map
+from dsom_jax.data import load_map
 from dsom_jax.errors import UserError, run_cli
 from dsom_jax.filters.methods import Settings, make_proposal
 from dsom_jax.geometry import transform_points
@@ -122,7 +122,7 @@ def new_worlds(args: Args, network: DSOM) -> list[tuple[Key, OccupancyGrid]]:
 
 def given_maps(args: Args, network: DSOM) -> list[tuple[Key, OccupancyGrid]]:
     """Maps at the network's scale and the keys of their scans."""
-    grids = [resample(load_ros_map(path), network.config.resolution) for path in args.maps]
+    grids = [resample(load_map(path), network.config.resolution) for path in args.maps]
     for path, grid in zip(args.maps, grids, strict=True):
         if not bool(grid.free.any()):
             raise UserError(f"{path}: no free cell at {network.config.resolution:.3f} m per cell; give another map")

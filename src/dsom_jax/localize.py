@@ -9,18 +9,18 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from rich.progress import Progress
 
 from dsom_jax import checkpoint, metrics, report
 from dsom_jax.cli import parse
-from dsom_jax.data import RawLog, load_log, load_ros_map, save_tum
+from dsom_jax.data import RawLog, Report, load_log, load_map, save_tum
 from dsom_jax.data.cut import segment_indices, splice, to_episode, without_repeats
+from dsom_jax.data.log import limited
 from dsom_jax.episode import Episode
 from dsom_jax.errors import UserError, run_cli
 from dsom_jax.filters.methods import DRAWN, REAL, make_filter, make_proposal
-from dsom_jax.lidar import LidarConfig, apply_limits
+from dsom_jax.lidar import LidarConfig
 from dsom_jax.montecarlo import Result, run, run_keys
 from dsom_jax.occupancy import OccupancyGrid, is_free
 from dsom_jax.types import Filter
@@ -31,13 +31,17 @@ class Args:
     """Cut a log into segments, start each without any prior, and tell how often the robot is found."""
 
     map: Path
-    """ROS map_server YAML."""
+    """ROS map_server YAML, a DXF drawing, or a YAML with `drawing: FILE.dxf` and how to read it."""
     log: Path
-    """CARMEN (.log, .clf, .gz), rosbag1, rosbag2 or mcap."""
+    """CARMEN (.log, .clf, .gz), rosbag1, rosbag2, mcap, or Rawseeds (*-SICK_FRONT.csv, or its folder)."""
     out: Path
     """Folder for summary.json and estimate.tum."""
     reference: Path | None = None
     """TUM trajectory of the base in the map frame; default: the log's own, where it has one."""
+    scan_topic: str | None = None
+    """LaserScan of a bag that has several."""
+    odom_topic: str | None = None
+    """Odometry of a bag that has several."""
     method: Literal["adam_robust", "adam", "mcl", "mixture_mcl"] = "adam_robust"
     """Particle filter."""
     proposal: Literal["likelihood_grid", "dsom", "hybrid", "uniform", "dual_features"] = "likelihood_grid"
@@ -92,10 +96,12 @@ def main() -> None:
     """Command line."""
     args = parse(Args, "python -m dsom_jax.localize")
     check(args)
-    grid = load_ros_map(args.map)
-    log = limited(load_log(args.log, reference=args.reference), args.laser_max_range)
-    for line in log.report.lines():
-        print(f"{args.log.name}: {line}")
+    left_out = Report()
+    grid = load_map(args.map, left_out)
+    log = load_log(args.log, reference=args.reference, scan_topic=args.scan_topic, odom_topic=args.odom_topic)
+    log = limited(log, args.laser_max_range)
+    for file, report_of in ((args.map, left_out), (args.log, log.report)):
+        print("".join(f"{file.name}: {line}\n" for line in report_of.lines()), end="")
     drives = cut(log, args)
     network = load_network(args, log.lidar)
     folder = report.output_folder(args.out)
@@ -136,17 +142,6 @@ def check_network(args: Args) -> None:
         chosen = "--method mcl" if args.method == "mcl" else f"--proposal {args.proposal}"
         fix = "leave it out, or give --proposal dsom or hybrid and a --method other than mcl"
         raise UserError(f"--checkpoint {args.checkpoint}: has no use with {chosen}; {fix}")
-
-
-def limited(log: RawLog, range_max: float) -> RawLog:
-    """The log with readings beyond ``range_max`` metres as no return."""
-    if range_max <= log.lidar.range_min:
-        raise UserError(f"--laser-max-range {range_max}: must exceed the lidar's range_min, {log.lidar.range_min} m")
-    lidar = replace(log.lidar, range_max=min(log.lidar.range_max, range_max))
-    ranges = np.asarray(apply_limits(jnp.asarray(log.ranges), lidar))
-    if not np.isfinite(ranges).any():
-        raise UserError(f"--laser-max-range {range_max}: no reading of {log.path} is shorter; give a greater one")
-    return replace(log, lidar=lidar, ranges=ranges)
 
 
 def cut(log: RawLog, args: Args) -> list[Drive]:

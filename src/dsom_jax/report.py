@@ -4,24 +4,29 @@
 "compilations", "estimate", "estimates"}. M is :func:`dsom_jax.metrics.summarize`; ``ms_per_step`` is the time of one
 update of all runs together; ``compilations`` counts the shapes of map and episode that were compiled; ``estimate`` says
 whether M judges the weighted ``mean`` or the heaviest ``cluster``, and ``estimates`` has M for both.
-Values that do not exist (a mean over no runs) are null.
+Values that do not exist (a mean over no runs) are null. ``runs.npz`` (``--per-run``) holds the columns of
+:class:`dsom_jax.run_table.RunTable`, one row for every run.
 """
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import os
 import tempfile
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich import box
 from rich.console import Console
 from rich.table import Table
 
 from dsom_jax.errors import UserError
+from dsom_jax.run_table import RunTable
 
 PHASES = {"global": "Global localization", "kidnap": "Kidnapping"}
 
@@ -40,13 +45,36 @@ def output_folder(path: str | Path) -> Path:
 
 
 def write_text(path: Path, text: str) -> None:
+    """Write ``path`` whole or not at all."""
+    write_bytes(path, text.encode())
+
+
+def write_bytes(path: Path, content: bytes) -> None:
     """Write ``path`` whole or not at all: a file beside it, then a rename."""
     draft = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        draft.write_text(text, encoding="utf-8")
+        draft.write_bytes(content)
         draft.replace(path)
     finally:
         draft.unlink(missing_ok=True)
+
+
+def write_runs(path: Path, table: RunTable) -> None:
+    """Write the columns of ``table`` to ``path`` (npz), atomically."""
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **table._asdict())
+    write_bytes(path, buffer.getvalue())
+
+
+def read_runs(path: str | Path) -> RunTable:
+    """The table that :func:`write_runs` wrote."""
+    try:
+        with np.load(path) as columns:
+            return RunTable(*(columns[name] for name in RunTable._fields))
+    except FileNotFoundError:
+        raise UserError(f"{path}: no such table of runs; make it with bench --per-run") from None
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        raise UserError(f"{path}: not a table of runs; make it again with bench --per-run") from None
 
 
 def write_json(path: Path, data: Any) -> None:

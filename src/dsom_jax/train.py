@@ -95,9 +95,9 @@ def read_config(path: Path | None) -> TrainConfig:
 
 def load_maps(paths: tuple[Path, ...], resolution: float) -> list[OccupancyGrid]:
     """Maps at the network's resolution, each with free space."""
-    from dsom_jax.data.ros_map import load_ros_map
+    from dsom_jax.data.open_map import load_map
 
-    grids = [resample(load_ros_map(path), resolution) for path in paths]
+    grids = [resample(load_map(path), resolution) for path in paths]
     for path, grid in zip(paths, grids, strict=True):
         if not bool(grid.free.any()):
             raise UserError(f"{path}: no free cell at {resolution:.3f} m per cell; give a map with free space")

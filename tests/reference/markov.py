@@ -1,4 +1,4 @@
-"""Grid localization's motion update, cell by cell: every old cell hands its belief to the new cells around its target."""
+"""Grid localization's motion update, cell by cell: each hands its belief to the new cells around its target."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def hat(distance: float) -> float:
 
 
 def predict(belief, free, odometry, resolution, slip):
-    """Belief (H, W, K), zero off ``free`` (H, W), after a body-frame increment; nothing enters cells that are not free."""
+    """Belief (H, W, K), zero off ``free`` (H, W), after a body-frame increment; none enters cells that are not free."""
     height, width, headings = belief.shape
     turn = 2 * math.pi / headings
     new = np.zeros_like(belief)

@@ -18,9 +18,7 @@ and is the reference trajectory, as SLAM programs write it, if it does not.
 
 from __future__ import annotations
 
-import gzip
 import re
-import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -28,7 +26,7 @@ import numpy as np
 
 from dsom_jax.data import se2
 from dsom_jax.data.carmen_lidar import LaserConfig, guess_config, lidar_of
-from dsom_jax.data.files import read_bytes
+from dsom_jax.data.files import read_lines
 from dsom_jax.data.log import RawLog, Report, limit_ranges, majority_beams, rigid_mount, tidy
 from dsom_jax.data.odometry import odometry_at
 from dsom_jax.errors import UserError
@@ -58,7 +56,7 @@ def load_carmen(path: str | Path, range_max: float | None = None) -> RawLog:
     from the log's own messages, or is detected (see :func:`dsom_jax.data.carmen_lidar.detect_no_return`).
     """
     path = Path(path)
-    messages = parse(_lines(path))
+    messages = parse(read_lines(path, "log"))
     if not messages.stamps:
         raise UserError(
             f"{path}: holds no FLASER, ROBOTLASER1 or RAWLASER1 line, so it is not a CARMEN log of a front laser"
@@ -74,17 +72,6 @@ def load_carmen(path: str | Path, range_max: float | None = None) -> RawLog:
         reference = se2.compose(reference, se2.inverse(np.array(lidar.mount)))
     ranges = limit_ranges(ranges, lidar.range_min, lidar.range_max)
     return tidy(RawLog(ranges, odometry, stamps, lidar, reference, messages.report, path))
-
-
-def _lines(path: Path) -> list[str]:
-    """Text lines of a plain or gzipped file."""
-    content = read_bytes(path, "log")
-    if content[:2] == b"\x1f\x8b":
-        try:
-            content = gzip.decompress(content)
-        except (OSError, EOFError, zlib.error):
-            raise UserError(f"{path}: broken gzip file; copy or download it again") from None
-    return content.decode(errors="replace").splitlines()
 
 
 def parse(lines: list[str]) -> Messages:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import bz2
+import gzip
 import os
 import tempfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -23,6 +26,18 @@ def read_bytes(path: str | Path, what: str) -> bytes:
         raise UserError(f"{path}: is a directory, not a {what}; give the file itself") from None
     except OSError as error:
         raise UserError(f"{path}: cannot read the {what} ({error.strerror}); check its permissions") from None
+
+
+def read_lines(path: str | Path, what: str) -> list[str]:
+    """Text lines of a file, plain or packed by gzip or bzip2; bytes that are no text are replaced."""
+    content = read_bytes(path, what)
+    for magic, kind, unpack in ((b"\x1f\x8b", "gzip", gzip.decompress), (b"BZh", "bzip2", bz2.decompress)):
+        if content.startswith(magic):
+            try:
+                content = unpack(content)
+            except (OSError, EOFError, ValueError, zlib.error):
+                raise UserError(f"{path}: broken {kind} file; copy or download it again") from None
+    return content.decode(errors="replace").splitlines()
 
 
 def read_yaml(path: str | Path, what: str) -> dict[str, Any]:

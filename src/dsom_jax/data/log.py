@@ -6,11 +6,12 @@ from collections import Counter
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 
 from dsom_jax.data import se2
 from dsom_jax.errors import UserError
-from dsom_jax.lidar import LidarConfig
+from dsom_jax.lidar import LidarConfig, apply_limits
 
 
 @dataclass
@@ -107,6 +108,17 @@ def limit_ranges(ranges: np.ndarray, range_min: float, no_return: float) -> np.n
     ranges[ranges >= np.float32(no_return)] = np.inf
     ranges[wrong] = np.nan
     return ranges
+
+
+def limited(log: RawLog, range_max: float) -> RawLog:
+    """The log with readings beyond ``range_max`` metres as no return."""
+    if range_max <= log.lidar.range_min:
+        raise UserError(f"--laser-max-range {range_max}: must exceed the lidar's range_min, {log.lidar.range_min} m")
+    lidar = replace(log.lidar, range_max=min(log.lidar.range_max, range_max))
+    ranges = np.asarray(apply_limits(jnp.asarray(log.ranges), lidar))
+    if not np.isfinite(ranges).any():
+        raise UserError(f"--laser-max-range {range_max}: no reading of {log.path} is shorter; give a greater one")
+    return replace(log, lidar=lidar, ranges=ranges)
 
 
 def select(log: RawLog, keep: np.ndarray) -> RawLog:

@@ -30,7 +30,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dsom_jax.data.files import read_bytes, write_atomic
-from dsom_jax.data.ros_map import load_ros_map
+from dsom_jax.data.open_map import load_map
 from dsom_jax.episode import Episode
 from dsom_jax.errors import UserError
 from dsom_jax.lidar import LidarConfig, LidarNoise
@@ -210,7 +210,7 @@ def _map(path: Path, where: str, entry: Mapping[str, Any]) -> tuple[str, Occupan
     if ("map" in entry) == ("world" in entry):
         raise UserError(f'{path}: {where}: give either map = "FILE.yaml" or world = SEED')
     if "map" in entry:
-        grid = load_ros_map(path.parent / str(entry["map"]))
+        grid = load_map(path.parent / str(entry["map"]))
         resolution = _number(path, where, entry, "resolution", grid.resolution, positive=True)
         return Path(str(entry["map"])).stem, grid if resolution == grid.resolution else resample(grid, resolution)
     seed = _number(path, where, entry, "world", 0, whole=True)

@@ -16,9 +16,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from dsom_jax.filters.adam_robust import AdamRobust, Draw, RobustState
+from dsom_jax.filters.adam_robust import AdamRobust, RobustState
 from dsom_jax.proposals.markov_grid import MarkovGrid, Recollection
-from dsom_jax.types import Array, Inputs, Key
+from dsom_jax.types import Array, Inputs
 
 
 @jax.tree_util.register_dataclass

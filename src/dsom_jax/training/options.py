@@ -26,8 +26,10 @@ def override(config: Any, given: Any, where: str) -> Any:
 
 
 def convert(old: Any, value: Any, where: str) -> Any:
-    """``value`` as the type of ``old``: numbers, text, booleans and tuples of numbers."""
+    """``value`` as the type of ``old``: numbers, text, booleans and tuples of numbers; an empty one takes any list."""
     if isinstance(old, tuple) and isinstance(value, list):
+        if not old:
+            return tuple(value)
         if len(value) != len(old):
             raise UserError(f"{where}: expected {len(old)} values like {list(old)!r}, got {value!r}")
         return tuple(convert(a, b, where) for a, b in zip(old, value, strict=True))

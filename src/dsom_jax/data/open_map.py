@@ -1,0 +1,30 @@
+"""One entry for every kind of map."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from dsom_jax.data.dxf import Drawing, load_drawing
+from dsom_jax.data.files import read_yaml
+from dsom_jax.data.log import Report
+from dsom_jax.data.ros_map import load_ros_map
+from dsom_jax.errors import UserError
+from dsom_jax.occupancy import OccupancyGrid
+from dsom_jax.training.options import override
+
+
+def load_map(path: str | Path, report: Report | None = None) -> OccupancyGrid:
+    """A ROS map_server yaml, a DXF drawing, or a yaml with ``drawing: FILE.dxf`` and fields of :class:`Drawing`.
+
+    A drawing that is named without a yaml is read with the defaults. ``report`` takes what was left out of it.
+    """
+    path = Path(path)
+    if path.suffix.lower() in (".dxf", ".dwg"):
+        return load_drawing(path, report=report)
+    fields = read_yaml(path, "map yaml")
+    if "drawing" not in fields:
+        return load_ros_map(path)
+    plan = fields.pop("drawing")
+    if not isinstance(plan, str):
+        raise UserError(f"{path}: drawing = {plan!r}: must be the name of a DXF file")
+    return load_drawing(path.parent / plan, override(Drawing(), fields, str(path)), report)
