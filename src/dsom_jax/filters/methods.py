@@ -105,16 +105,18 @@ REAL = Settings(
     raycast=RaycastConfig("table", surface=_SCANNED),
     robust_raycast=RaycastConfig("exact", surface=_SCANNED),
     grid=LikelihoodGridConfig(raycast=RaycastConfig("exact", surface=_SCANNED)),
+    memory=True,
 )
 """What ``localize`` starts from, for maps made from scans."""
 
-_FURNISHED = BeamModel(0.45, 0.4, 0.05, 0.1, sigma_hit=0.3)
+_FURNISHED = BeamModel(0.45, 0.4, 0.05, 0.1, sigma_hit=0.6)
 DRAWN = replace(
     REAL,
-    robust=replace(REAL.robust, model=replace(_FURNISHED, temper=0.2)),
-    grid=replace(REAL.grid, model=replace(_FURNISHED, temper=0.1)),
+    robust=replace(REAL.robust, model=replace(_FURNISHED, temper=0.1)),
+    grid=replace(REAL.grid, model=replace(_FURNISHED, temper=0.05)),
+    markov=MarkovGridConfig(kidnap=1e-9),
 )
-"""For floor plans: walls a little elsewhere, furniture that cuts four beams in ten short (``experiments/robust``)."""
+"""For floor plans: walls elsewhere, furniture that cuts four beams in ten short (``experiments/robust``)."""
 
 
 def build_filter(
