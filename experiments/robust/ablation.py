@@ -34,6 +34,16 @@ def model(**changes: Any) -> Callable[[Settings], Settings]:
     return lambda s: replace(s, robust=replace(s.robust, model=replace(s.robust.model, **changes)))
 
 
+def memoryless(**changes: Any) -> Callable[[Settings], Settings]:
+    """Settings without memory, with other fields of RobustConfig: there eps is the filter's own."""
+    return lambda s: replace(robust(**changes)(s), memory=False)
+
+
+def markov(**changes: Any) -> Callable[[Settings], Settings]:
+    """Settings with another motion of the memory."""
+    return lambda s: replace(s, markov=replace(s.markov, **changes))
+
+
 def slip(value: float) -> Callable[[Settings], Settings]:
     """Settings with other slip of the wheels."""
     return lambda s: replace(s, robust_motion=replace(s.robust_motion, slip=value))
@@ -51,10 +61,12 @@ def surface(value: float) -> Callable[[Settings], Settings]:
 
 VARIANTS: dict[str, Callable[[Settings], Settings]] = {
     "base": lambda s: s,
-    "eps-1e-3": robust(kidnap=1e-3),
-    "eps-1e-4": robust(kidnap=1e-4),
-    "eps-1e-5": robust(kidnap=1e-5),
-    "eps-1e-7": robust(kidnap=1e-7),
+    "no-memory": memoryless(),
+    "no-memory-eps-1e-3": memoryless(kidnap=1e-3),
+    "no-memory-eps-1e-7": memoryless(kidnap=1e-7),
+    "memory-eps-1e-4": markov(kidnap=1e-4),
+    "memory-eps-1e-9": markov(kidnap=1e-9),
+    "memory-slip-0": markov(slip=0.0),
     "flatten-0": robust(flatten=0.0),
     "flatten-0.3": robust(flatten=0.3),
     "slip-0": slip(0.0),
@@ -148,8 +160,8 @@ def report(folder: Path) -> str:
 HEAD = f"""\
 # What each idea of AdaM robust is worth
 
-Written by `python experiments/robust/ablation.py`; do not edit. One choice is changed at a time; base: eps
-{REAL.robust.kidnap:g}, flatten {REAL.robust.flatten:g}, low_min {REAL.robust.low_min:g}, temper
+Written by `python experiments/robust/ablation.py`; do not edit. One choice is changed at a time; base: memory with eps
+{REAL.markov.kidnap:g} and slip {REAL.markov.slip:g}, flatten {REAL.robust.flatten:g}, low_min {REAL.robust.low_min:g}, temper
 {REAL.robust.model.temper:.3g}, sigma_hit {REAL.robust.model.sigma_hit:g} m, surface {REAL.robust_raycast.surface:g}.
 The first numbers are for the start without prior, the last four for the kidnapping that follows. Terms as in
 [the real logs](../real/REPORT.md)."""
