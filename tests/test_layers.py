@@ -17,7 +17,7 @@ LAYERS = (
     ("motion", "sensor", "nn", "simulate"),
     ("proposals", "metrics", "statistics", "run_table"),
     ("filters", "training", "montecarlo"),
-    ("data", "checkpoint", "run_folder", "plotting", "report"),
+    ("data", "checkpoint", "run_folder", "plotting", "report", "judging"),
     ("cli", "train", "bench", "localize", "evaluate"),
 )
 DEVICE = 5

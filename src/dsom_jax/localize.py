@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import jax
 import numpy as np
@@ -14,15 +13,15 @@ from rich.progress import Progress
 
 from dsom_jax import checkpoint, metrics, report
 from dsom_jax.cli import parse
-from dsom_jax.data import RawLog, Report, load_log, load_map, save_tum
+from dsom_jax.data import RawLog, Report, load_log, load_map
 from dsom_jax.data.cut import segment_indices, splice, to_episode, without_repeats
 from dsom_jax.data.log import limited
-from dsom_jax.episode import Episode
 from dsom_jax.errors import UserError, run_cli
 from dsom_jax.filters.methods import DRAWN, REAL, make_filter, make_proposal
+from dsom_jax.judging import Drive, Outcome, save_estimate, scores
 from dsom_jax.lidar import LidarConfig
-from dsom_jax.montecarlo import Result, run, run_keys
-from dsom_jax.occupancy import OccupancyGrid, is_free
+from dsom_jax.montecarlo import run, run_keys
+from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.types import Filter
 
 
@@ -62,6 +61,8 @@ class Args:
     """Metres driven between updates."""
     update_min_a: float = 0.2
     """Radians turned between updates."""
+    memory: bool = True
+    """Let adam_robust remember earlier scans on the likelihood grid; --no-memory judges every scan on its own."""
     kidnap: bool = False
     """Join each segment to the one half the log away, as an unnoticed kidnapping."""
     t_cut: float = 0.6
@@ -75,21 +76,6 @@ class Args:
 
 
 MANY = 1_000_000
-
-
-class Drive(NamedTuple):
-    """One episode to localize, and the log's stamps (T,) of its updates."""
-
-    episode: Episode
-    stamps: np.ndarray
-
-
-class Outcome(NamedTuple):
-    """Result of one drive and the seconds that it took (compilation excluded)."""
-
-    drive: Drive
-    result: Result
-    seconds: float
 
 
 def main() -> None:
@@ -195,6 +181,7 @@ def build(args: Args, grid: OccupancyGrid, lidar: LidarConfig, network: Any = No
     """The filter that the arguments ask for."""
     kind = DRAWN if args.map_kind == "drawn" else REAL
     settings = replace(kind, particles=args.particles, t_cut=args.t_cut, max_beams=args.max_beams, seed=args.seed)
+    settings = replace(settings, memory=args.memory)
     name = "uniform" if args.method == "mcl" else args.proposal
     return make_filter(args.method, make_proposal(name, grid, lidar, settings, network), grid, lidar, settings)
 
@@ -214,73 +201,19 @@ def localize(filter: Filter, drives: Any, runs: int, seed: int) -> list[Outcome]
     return outcomes
 
 
-def estimates(outcome: Outcome, method: str) -> np.ndarray:
-    """(R, T, 3) answers of a filter: the heaviest cluster, or for the paper's filters the weighted mean."""
-    info = outcome.result.info
-    return np.asarray(info.cluster if method == "adam_robust" else info.mean)
-
-
 def summarize(outcomes: list[Outcome], grid: OccupancyGrid, args: Args) -> dict[str, Any]:
     """``summary.json``: the keys of DESIGN section 5 and, beside them, every segment on its own."""
     updates = sum(len(o.drive.stamps) for o in outcomes)
     timed = outcomes[1:] or outcomes
     head = {
         "map": str(args.map), "log": str(args.log), "map_kind": args.map_kind,
-        "method": args.method, "proposal": args.proposal,
+        "method": args.method, "proposal": args.proposal, "memory": args.memory,
         "particles": args.particles, "segments": len(outcomes), "runs": args.runs, "updates": updates,
         "steps_per_segment": len(outcomes[0].drive.stamps), "seed": args.seed,
         "ms_per_update": 1e3 * float(np.median([o.seconds / len(o.drive.stamps) for o in timed])),
         "confident": float(np.mean([np.asarray(o.result.info.lost) < metrics.CONFIDENT for o in outcomes])),
     }  # fmt: skip
-    if all(np.isnan(o.drive.episode.poses).all() for o in outcomes):
-        return head | {"reference": None}
-    judged = [judge(outcome, args.method) for outcome in outcomes]
-    scores = score(judged, "global", args.seed)
-    if args.kidnap:
-        scores["kidnap"] = score(judged, "kidnap", args.seed)
-    return head | scores | {"by_segment": [describe(o, j, grid) for o, j in zip(outcomes, judged, strict=True)]}
-
-
-def judge(outcome: Outcome, method: str) -> dict[str, tuple[metrics.Runs, np.ndarray]]:
-    """Metrics and metres driven until convergence (R,) of each phase."""
-    episode, poses = outcome.drive.episode, estimates(outcome, method)
-    truth, lost = np.asarray(episode.poses), np.asarray(outcome.result.info.lost)
-    judged = {}
-    for phase, parts in metrics.phases(episode.kidnapped).items():
-        for part in parts[:1]:
-            runs = metrics.measure(poses[:, part], truth[part], lost[:, part])
-            judged[phase] = runs, metrics.metres_travelled(runs.steps, np.asarray(episode.odometry)[part])
-    return judged
-
-
-def score(judged: list[dict[str, tuple[metrics.Runs, np.ndarray]]], phase: str, seed: int) -> dict[str, Any]:
-    """All runs of one phase together."""
-    metres = np.concatenate([j[phase][1] for j in judged])
-    known = metres[~np.isnan(metres)]
-    median = float(np.median(known)) if len(known) else math.nan
-    return metrics.summarize(metrics.pool([j[phase][0] for j in judged]), seed) | {"metres_median": median}
-
-
-def describe(outcome: Outcome, judged: dict[str, Any], grid: OccupancyGrid) -> dict[str, Any]:
-    """One segment: where it starts in the log, how much of it lies on mapped free space, how often it succeeded."""
-    runs = judged["global"][0]
-    poses = outcome.drive.episode.poses
-    known = ~np.isnan(np.asarray(poses)).any(-1)
-    return {
-        "start_stamp": float(outcome.drive.stamps[0]),
-        "on_map": float(np.asarray(is_free(grid, poses))[known].mean()) if known.any() else None,
-        "converged": metrics.ratio((runs.steps >= 0).sum(), len(runs.steps)),
-        "strict_success": metrics.ratio(metrics.strict_success(runs).sum(), len(runs.steps)),
-        "e_pos_m_median": float(np.median(runs.e_pos)) if len(runs.e_pos) else math.nan,
-    }
-
-
-def save_estimate(path: Path, outcomes: list[Outcome]) -> None:
-    """Heaviest cluster of run 0 at every update, in log time; of overlapping segments the earlier one counts."""
-    stamps = np.concatenate([o.drive.stamps for o in outcomes])
-    poses = np.concatenate([np.asarray(o.result.info.cluster)[0] for o in outcomes])
-    stamps, first = np.unique(stamps, return_index=True)
-    save_tum(path, stamps, poses[first])
+    return head | scores(outcomes, grid, args.method, args.seed)
 
 
 def print_summary(summary: dict[str, Any]) -> None:
