@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from flax import nnx
 from jax.custom_batching import sequential_vmap
 
+from dsom_jax.filters.common import Info, describe
 from dsom_jax.geometry import compose
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.nn.local_view import CornerMap, corner_map, map_for
@@ -18,8 +18,6 @@ from dsom_jax.nn.view_net import ScanCode
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.proposals.uniform import FreeSpace, free_space
 from dsom_jax.types import Array, Inputs, Key
-
-T = TypeVar("T")
 
 
 class Prior(NamedTuple):
@@ -31,7 +29,7 @@ class Prior(NamedTuple):
 
 @dataclass(frozen=True)
 class Learned:
-    """A network that weighs particles on one map.
+    """A network that weighs particles on one map; what is derived from it has ``advance``, a differentiable update.
 
     Attributes:
         weights: parameters of the network.
@@ -41,8 +39,6 @@ class Learned:
         graph: structure of the network (static).
         lidar: beams that are used (static); ``beam_step`` of the scan's beams are skipped between them (static).
         particles: N (static).
-        separate: evaluate the network for one run after the other (static). Each run then gets the same bits whatever
-            else is computed beside it, and its intermediate results fit the cache; but it cannot be differentiated.
     """
 
     weights: Any
@@ -53,23 +49,10 @@ class Learned:
     lidar: LidarConfig = field(metadata={"static": True})
     beam_step: int = field(metadata={"static": True})
     particles: int = field(metadata={"static": True})
-    separate: bool = field(default=True, metadata={"static": True})
 
     def network(self) -> Any:
         """The network with its weights."""
         return nnx.merge(self.graph, self.weights)
-
-    def evaluate(self, call: Callable[..., T], *arguments: Any) -> T:
-        """``call(network, map, *arguments)``."""
-
-        def evaluate(weights: Any, place: CornerMap, *arguments: Any) -> T:
-            return call(nnx.merge(self.graph, weights), place, *arguments)
-
-        if not self.separate:
-            return evaluate(self.weights, self.place, *arguments)
-        # Without the barriers a single run, whose loop vanishes, would be fused and rounded in another way.
-        arguments = jax.lax.optimization_barrier(arguments)
-        return jax.lax.optimization_barrier(sequential_vmap(evaluate)(self.weights, self.place, *arguments))
 
     def prepare(self, inputs: Inputs) -> ScanCode:
         """Reading of the scan, for all particles of all runs."""
@@ -80,6 +63,23 @@ class Learned:
         if self.prior is None:
             return self.space.sample(key, None, self.particles)[0]
         return scatter(key, self.prior, self.particles)
+
+    def step(self, key: Key, state: Any, inputs: Inputs, prepared: ScanCode) -> tuple[Any, Info]:
+        """One update and its diagnostics; these filters neither redraw particles nor start again.
+
+        Runs are computed one after the other, as the results of one fit the cache and those of all do not. Each then
+        also gets the same bits whatever is computed beside it; the barriers keep a run whose loop vanishes, because
+        it is the only one, from being fused with its surroundings and rounded in another way.
+        """
+        return _one_run(self, key, state, inputs, prepared)
+
+
+@sequential_vmap
+def _one_run(filter: Any, key: Key, state: Any, inputs: Inputs, prepared: ScanCode) -> tuple[Any, Info]:
+    key, state, inputs, prepared = jax.lax.optimization_barrier((key, state, inputs, prepared))
+    state = jax.lax.optimization_barrier(filter.advance(key, state, inputs, prepared))
+    info = describe(state.poses, jnp.exp(state.log_weights), jnp.float32(0), jnp.bool_(False))
+    return jax.lax.optimization_barrier((state, info))
 
 
 def scatter(key: Key, prior: Prior, n: int) -> Array:

@@ -6,12 +6,9 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 
-from dsom_jax.filters.common import Info, describe
 from dsom_jax.filters.learned import Learned, Prior, bind, even
 from dsom_jax.lidar import LidarConfig
-from dsom_jax.nn.pf_net import PFNet
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.resampling import soft_resample
 from dsom_jax.types import Array, Inputs, Key
@@ -52,13 +49,8 @@ class PFNetFilter(Learned):
         noise = jax.random.normal(k_move, state.poses.shape)
         poses = network.move(state.poses[ancestors], inputs.odometry, noise)
         # Weigh
-        log_weights = log_weights + self.evaluate(PFNet.log_likelihood, poses, prepared)
+        log_weights = log_weights + network.log_likelihood(self.place, poses, prepared)
         return PFNetState(poses, jax.nn.log_softmax(log_weights))
-
-    def step(self, key: Key, state: PFNetState, inputs: Inputs, prepared: Any) -> tuple[PFNetState, Info]:
-        """One update and its diagnostics; PF-Net neither redraws particles nor starts again."""
-        state = self.advance(key, state, inputs, prepared)
-        return state, describe(state.poses, jnp.exp(state.log_weights), jnp.float32(0), jnp.bool_(False))
 
 
 def pf_net(

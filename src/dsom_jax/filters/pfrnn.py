@@ -8,11 +8,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from dsom_jax.filters.common import Info, describe
 from dsom_jax.filters.learned import Learned, Prior, bind, even
 from dsom_jax.geometry import compose
 from dsom_jax.lidar import LidarConfig
-from dsom_jax.nn.pfrnn import PFRNN
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.resampling import soft_resample
 from dsom_jax.types import Array, Inputs, Key
@@ -57,13 +55,8 @@ class PFRNNFilter(Learned):
         # Update the latent particles
         noise = jax.random.normal(k_cell, state.hidden.shape)
         moved = (poses, state.hidden[ancestors], inputs.odometry, prepared, noise)
-        poses, hidden, log_likelihood = self.evaluate(PFRNN.update, *moved)
+        poses, hidden, log_likelihood = network.update(self.place, *moved)
         return PFRNNState(poses, hidden, jax.nn.log_softmax(log_weights + log_likelihood))
-
-    def step(self, key: Key, state: PFRNNState, inputs: Inputs, prepared: Any) -> tuple[PFRNNState, Info]:
-        """One update and its diagnostics; PFRNN neither redraws particles nor starts again."""
-        state = self.advance(key, state, inputs, prepared)
-        return state, describe(state.poses, jnp.exp(state.log_weights), jnp.float32(0), jnp.bool_(False))
 
 
 def pfrnn(

@@ -147,10 +147,10 @@ def _frame(places: CornerMap) -> tuple[Array, float]:
 
 
 def make_tracker(params: Any, graph: Any, config: FilterTrainConfig, place: CornerMap) -> Learned:
-    """The filter on one map, differentiable; its scans are thinned already."""
+    """The filter on one map; its scans are thinned already."""
     lidar = config.data.lidar.every(config.data.beam_step)
     # Its particles are given, so that no free space is needed.
-    return FILTERS[config.kind](params, place, None, None, graph, lidar, 1, config.particles, False)  # type: ignore[arg-type]
+    return FILTERS[config.kind](params, place, None, None, graph, lidar, 1, config.particles)  # type: ignore[arg-type]
 
 
 def window_losses(states: Any, window: Window, config: FilterTrainConfig) -> tuple[Array, Array]:
