@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -31,6 +32,15 @@ from dsom_jax.training.filter_loop import (
 from dsom_jax.training.filter_loss import huber, particle_loss, prediction_loss
 from dsom_jax.training.sequences import make_windows, path_distance, plan_paths, spoil_world
 from learned_kit import DATA, KINDS, MODELS, PF_NET, training
+
+
+@pytest.fixture(scope="module", autouse=True)
+def compile_fast():
+    """Nearly all of the time here goes into compiling, and half of that into what tiny problems do not repay."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+
 
 GRID = replace(tiny_world.grid(), origin=jnp.zeros(3))
 
@@ -65,7 +75,7 @@ def test_windows_are_pieces_of_paths(pool, windows):
 
 def test_odometry_tells_the_motion_with_some_noise(windows):
     moved = jax.vmap(dsom_jax.relative)(windows.poses[:, :-1], windows.poses[:, 1:])
-    error = np.asarray(windows.odometry[:, 1:] - moved)
+    error = np.array(windows.odometry[:, 1:] - moved)
     error[..., 2] = np.asarray(dsom_jax.wrap_angle(jnp.asarray(error[..., 2])))
     # Of 0.2 m or 0.3 rad: standard deviations below 0.02 m and 0.04 rad; five of them.
     assert (np.abs(error) < np.array([0.1, 0.1, 0.2])).all() and np.abs(error).max() > 0
@@ -73,7 +83,8 @@ def test_odometry_tells_the_motion_with_some_noise(windows):
 
 def test_the_world_differs_from_the_map_but_not_on_the_path(pool):
     poses = pool.poses[0, :4]
-    worlds = [spoil_world(jax.random.key(n), GRID, poses, DATA) for n in range(6)]
+    spoil = jax.jit(lambda key: spoil_world(key, GRID, poses, DATA))
+    worlds = [spoil(jax.random.key(n)) for n in range(6)]
     assert any((world.occupied & ~GRID.occupied).any() for world in worlds)
     assert any((GRID.occupied & ~world.occupied).any() for world in worlds)
     far = np.asarray(path_distance(GRID, poses)) > 1.0 + 2.5  # removed pieces are at most 2.5 m wide
@@ -194,14 +205,19 @@ def weights(folder: Path) -> bytes:
 
 
 def test_a_run_that_lost_its_end_resumes_bit_for_bit(files, monkeypatch):
+    made, parts = [], train_filter.parts
+
+    def compiled_once(run):
+        made.append(made[0] if made else parts(run))
+        return made[0]._replace(state=train_filter.first_state(run))
+
+    monkeypatch.setattr(train_filter, "parts", compiled_once)
     command(files, monkeypatch, "run")
     whole, log = weights(files / "run"), (files / "run" / "metrics.jsonl").read_text()
     record = json.loads((files / "run" / "provenance.json").read_text())
     assert (record["kind"], record["steps"], record["data"]) == ("pfrnn", 4, ["map.yaml"])
     assert record["samples"] == 4 * 2 * 3 and "tracked" in record["metrics"]
     # As if it had been killed after the third step: the last state is of the second.
-    import shutil
-
     shutil.rmtree(files / "run" / "state-00000004")
     command(files, monkeypatch, "run", "--resume")
     assert weights(files / "run") == whole

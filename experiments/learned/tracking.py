@@ -1,4 +1,4 @@
-"""Do PF-Net and PFRNN track? ``python experiments/learned/tracking.py [--filters pf_net] [--drives-per-map 60] [--runs 3]``
+"""Do PF-Net and PFRNN track? ``python experiments/learned/tracking.py [--filters pf_net] [--runs 3]``
 
 Drives that training did not see, in the maps that it was done in, each from a roughly known start: the middle of the
 particles is off by about 0.3 m and 10 deg, and they are scattered about it as widely. Every drive meets 20 unknown
