@@ -152,10 +152,3 @@ def test_maps_come_to_the_scale_of_the_network():
 def test_lidars_that_do_not_fit(lidar, reason):
     found = VIEW.misfit(lidar)
     assert found is None if reason is None else reason in found
-
-
-def test_bad_views_are_refused():
-    with pytest.raises(ValueError, match="cells = 12"):
-        ViewConfig(cells=12)
-    with pytest.raises(ValueError, match="positive"):
-        ViewConfig(resolution=0.0)

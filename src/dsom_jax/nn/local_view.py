@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dsom_jax import checks
 from dsom_jax.errors import UserError
 from dsom_jax.geometry import rotate
 from dsom_jax.lidar import LidarConfig, scan_points
@@ -47,10 +48,10 @@ class ViewConfig:
     reach_min: float = 10.0
 
     def __post_init__(self) -> None:
-        if self.cells < 8 or self.cells % (2 * PATCH):
-            raise ValueError(f"ViewConfig.cells = {self.cells}: give a multiple of {2 * PATCH}")
-        if min(self.resolution, self.map_resolution) <= 0 or self.beams < 1:
-            raise ValueError("ViewConfig: resolution, map_resolution and beams are positive")
+        checks.count(self, "cells beams")
+        if self.cells % (2 * PATCH):
+            raise ValueError(checks.message(self, "cells", f"give a multiple of {2 * PATCH}"))
+        checks.positive(self, "resolution map_resolution fov_min reach_min")
 
     @property
     def patches(self) -> int:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
+from dsom_jax import checks
 from dsom_jax.geometry import compose
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.nn.layers import Dense
@@ -37,12 +38,9 @@ class PFNetConfig:
     min_theta: float = 0.01
 
     def __post_init__(self) -> None:
-        if min(self.width, self.features) < 1:
-            raise ValueError("PFNetConfig: width and features must be positive")
-        if not 0 < self.alpha <= 1:
-            raise ValueError(f"PFNetConfig.alpha = {self.alpha}: give a share above 0, at most 1")
-        if min(self.min_xy, self.min_theta) < 0:
-            raise ValueError("PFNetConfig: min_xy and min_theta cannot be negative")
+        checks.count(self, "width features")
+        checks.share(self, "alpha", excluding="(")
+        checks.not_negative(self, "min_xy min_theta")
 
     @property
     def resolution(self) -> float:

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
+from dsom_jax import checks
 from dsom_jax.geometry import compose
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.nn.layers import Dense
@@ -48,12 +49,9 @@ class PFRNNConfig:
     step_theta: float = 0.3
 
     def __post_init__(self) -> None:
-        if min(self.width, self.features, self.hidden) < 1:
-            raise ValueError("PFRNNConfig: width, features and hidden must be positive")
-        if not 0 < self.alpha <= 1:
-            raise ValueError(f"PFRNNConfig.alpha = {self.alpha}: give a share above 0, at most 1")
-        if min(self.step_xy, self.step_theta) <= 0:
-            raise ValueError("PFRNNConfig: step_xy and step_theta must be positive")
+        checks.count(self, "width features hidden")
+        checks.share(self, "alpha", excluding="(")
+        checks.positive(self, "step_xy step_theta")
 
     @property
     def resolution(self) -> float:

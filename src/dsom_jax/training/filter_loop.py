@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import optax
 from flax import nnx
 
+from dsom_jax import checks
 from dsom_jax.compiling import training_options
 from dsom_jax.filters.learned import Learned, Prior, scatter
 from dsom_jax.filters.pf_net import PFNetFilter
@@ -67,13 +68,12 @@ class FilterTrainConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if min(self.batch, self.particles) < 1:
-            raise ValueError("FilterTrainConfig: batch and particles must be positive")
-        if not 0 <= self.strays < 1:
-            raise ValueError(f"FilterTrainConfig.strays = {self.strays}: give a share from 0 to below 1")
-        for name, (least, most) in (("start_xy", self.start_xy), ("start_theta", self.start_theta)):
-            if not 0 < least <= most:
-                raise ValueError(f"FilterTrainConfig.{name}: needs 0 < least <= largest")
+        checks.count(self, "batch particles")
+        checks.interval(self, "start_xy start_theta", 1e-3)
+        checks.share(self, "strays ema", excluding=")")
+        checks.not_negative(self, "heading_weight particle_weight")
+        checks.positive(self, "particle_xy particle_theta learning_rate clip")
+        checks.count(self, "warmup seed", 0)
 
     @property
     def kind(self) -> str:

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dsom_jax import checks
 from dsom_jax.lidar import LidarConfig, LidarNoise, observe
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.raycast import RaycastConfig, cast_rays, make_tables
@@ -53,10 +54,12 @@ class SequenceConfig:
     drive: DriveConfig = field(default_factory=DriveConfig)
 
     def __post_init__(self) -> None:
-        if not 2 <= self.window <= self.length:
-            raise ValueError(f"SequenceConfig.window = {self.window}: give 2 to length = {self.length} updates")
-        if min(self.drives, self.beam_step) < 1 or min(self.obstacles, self.removed) < 0:
-            raise ValueError("SequenceConfig: drives and beam_step are at least 1, obstacles and removed not negative")
+        checks.count(self, "beam_step drives length")
+        checks.count(self, "window", 2)
+        checks.within(self, "window", 2, self.length, f"must not exceed length = {self.length}")
+        checks.count(self, "obstacles removed", 0)
+        checks.not_negative(self, "noise")
+        checks.share(self, "dropout short")
 
 
 class PathPool(NamedTuple):
