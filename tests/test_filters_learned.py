@@ -109,6 +109,7 @@ def test_start_anywhere_or_from_a_prior(kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_update(kind, episode):
+    chex.clear_trace_counter()
     filter = make(kind, 24, PRIOR)
     step = jax.jit(chex.assert_max_traces(lambda f, key, state, now: f.step(key, state, now, f.prepare(now)), n=1))
     state = filter.init(jax.random.key(0))

@@ -25,6 +25,8 @@ from dsom_jax.nn.local_view import (
 from dsom_jax.occupancy import from_cells
 from reference.local_view import crop
 
+draw = jax.jit(scan_view, static_argnums=(1, 2))
+look = jax.jit(local_view, static_argnums=2)
 VIEW = ViewConfig(cells=16, resolution=0.3, map_resolution=0.25, beams=32, reach_min=5.0)
 
 
@@ -65,7 +67,7 @@ def test_a_full_map_is_full_up_to_its_outermost_centres():
 def test_view_is_the_slow_crop():
     grid = tiny_world.grid()  # its origin is shifted and turned
     local = np.array([[3.1, 2.3, 0.3], [0.2, 4.8, -2.9], [5.9, 0.1, 1.57], [-9.0, 2.0, 0.0]], np.float32)
-    views = jax.jit(local_view, static_argnums=2)(corner_map(grid), grid.from_grid(jnp.asarray(local)), VIEW)
+    views = look(corner_map(grid), grid.from_grid(jnp.asarray(local)), VIEW)
     for pose, view in zip(local, np.asarray(views), strict=True):
         # float32 positions of about 20 cells are off by a few 1e-6 cells, and slopes are at most one per cell
         np.testing.assert_allclose(picture(view), crop(tiny_world.cells(), 0.25, pose, 16, 0.3), atol=3e-5)
@@ -93,7 +95,7 @@ def square_room() -> tuple[np.ndarray, LidarConfig]:
 
 def test_scan_of_a_square_room():
     ranges, lidar = square_room()
-    hit, through, seen = np.moveaxis(picture(scan_view(jnp.asarray(ranges), lidar, VIEW)), -1, 0)
+    hit, through, seen = np.moveaxis(picture(draw(jnp.asarray(ranges), lidar, VIEW)), -1, 0)
     centres = (np.arange(16) + 0.5 - 8) * 0.3
     x, y = np.meshgrid(centres, centres)
     depth = np.maximum(np.abs(x), np.abs(y))
@@ -106,26 +108,26 @@ def test_scan_of_a_square_room():
 def test_invalid_beams_are_not_seen_and_missing_returns_see_through():
     ranges, lidar = square_room()
     ahead = np.abs(lidar.angles()) < math.pi / 4
-    blind = picture(scan_view(jnp.where(ahead, jnp.nan, ranges), lidar, VIEW))
+    blind = picture(draw(jnp.where(ahead, jnp.nan, ranges), lidar, VIEW))
     assert (blind[7:9, 10:] == 0).all() and (blind[7:9, :6, 2] == 1).all()
-    close = picture(scan_view(jnp.where(ahead, -jnp.inf, ranges), lidar, VIEW))
+    close = picture(draw(jnp.where(ahead, -jnp.inf, ranges), lidar, VIEW))
     np.testing.assert_array_equal(close, blind)
-    empty = picture(scan_view(jnp.where(ahead, jnp.inf, ranges), lidar, VIEW))
+    empty = picture(draw(jnp.where(ahead, jnp.inf, ranges), lidar, VIEW))
     assert (empty[7:9, 10:, 1] == 1).all() and (empty[7:9, 10:, 0] == 0).all()
 
 
 def test_directions_without_beams_are_not_seen():
     lidar = LidarConfig(beams=180, angle_min=-math.pi / 2, angle_increment=math.pi / 180, range_max=5.0)
-    seen = picture(scan_view(jnp.full(180, 2.0), lidar, VIEW))[..., 2]
+    seen = picture(draw(jnp.full(180, 2.0), lidar, VIEW))[..., 2]
     assert (seen[:, 9:] == 1).all() and (seen[:, :6] == 0).all()
 
 
 def test_pictures_of_map_and_scan_agree_at_the_true_pose():
     episode, place = tiny_world.drive(3), corner_map(tiny_world.grid())
-    scan = scan_view(episode.ranges[0], tiny_world.LIDAR, VIEW)
+    scan = draw(episode.ranges[0], tiny_world.LIDAR, VIEW)
 
     def agreement(pose):
-        return float((local_view(place, pose, VIEW) * (scan[..., 0] - 0.3 * scan[..., 1])).sum())
+        return float((look(place, pose, VIEW) * (scan[..., 0] - 0.3 * scan[..., 1])).sum())
 
     true = agreement(episode.poses[0])
     shifts = ([0.4, 0, 0], [-0.4, 0, 0], [0, 0.4, 0], [0, -0.4, 0], [0, 0, 0.3], [0, 0, -0.3])
