@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dsom_jax import bench, report
+from dsom_jax import bench, checkpoint, report
 from dsom_jax.episode import Episode
 from dsom_jax.errors import UserError, run_cli
 from dsom_jax.lidar import LidarConfig
@@ -197,6 +197,9 @@ def test_default_methods_are_those_that_can_be_run(tmp_path):
         (("--methods", "mcl,magic"), "magic"),
         (("--methods", "adam_dsom"), "--checkpoint"),
         (("--methods", "robust_hybrid"), "--checkpoint"),
+        (("--methods", "mcl,pf_net"), "--pf-net"),
+        (("--methods", "pfrnn"), "--pfrnn"),
+        (("--methods", "pfrnn", "--pfrnn", "FILE"), "FILE"),
         (("--suite", "nowhere"), "nowhere"),
         (("--out", "FILE"), "--out"),
         (("--per-run",), "--out"),
@@ -206,7 +209,7 @@ def test_default_methods_are_those_that_can_be_run(tmp_path):
 def test_bad_input_is_one_line_and_exit_code_2_before_any_work(suite, monkeypatch, tmp_path, capsys, words, field):
     (tmp_path / "FILE").touch()
     monkeypatch.setattr(bench, "collect", lambda *_: pytest.fail("work was begun"))
-    monkeypatch.setattr(bench.networks, "shipped", lambda: None)
+    monkeypatch.setattr(checkpoint, "shipped", lambda *_: None)
     with pytest.raises(SystemExit) as stop:
         command(monkeypatch, *(word.replace("FILE", str(tmp_path / "FILE")) for word in words))
     error = capsys.readouterr().err

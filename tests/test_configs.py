@@ -17,7 +17,8 @@ from dsom_jax.filters.mixture import MixtureMCL
 from dsom_jax.filters.updates import FilterConfig
 from dsom_jax.lidar import LidarConfig, LidarNoise
 from dsom_jax.motion import AdditiveMapFrame, OdometryMotion, OmniMotion
-from dsom_jax.nn import DSOMConfig
+from dsom_jax.nn import DSOMConfig, PFNetConfig, PFRNNConfig
+from dsom_jax.nn.local_view import ViewConfig
 from dsom_jax.proposals.dual_features import DualFeaturesConfig
 from dsom_jax.proposals.hybrid import HybridConfig
 from dsom_jax.proposals.likelihood_grid import LikelihoodGridConfig
@@ -26,7 +27,9 @@ from dsom_jax.sensor import BeamModel, LikelihoodField, ScoreModel
 from dsom_jax.simulate.drive import DriveConfig
 from dsom_jax.simulate.worlds import WorldConfig
 from dsom_jax.training.batches import ScanConfig, random_noise
+from dsom_jax.training.filter_loop import FilterTrainConfig
 from dsom_jax.training.loop import StageConfig, TrainConfig
+from dsom_jax.training.sequences import SequenceConfig
 
 NAN, INF = math.nan, math.inf
 FILTER = {"world": None, "config": None}
@@ -93,6 +96,23 @@ WRONG: dict[type, tuple[dict, dict]] = {
     TrainConfig: ({}, {
         "maps_share": (1.1,), "late_share": (-0.1,), "learning_rate": (0.0, -1e-3, NAN, INF), "warmup": (-1,),
         "clip": (0.0,), "blur": (0.0,), "similarity_weight": (-1.0,), "ema": (1.0, NAN), "seed": (-1,),
+    }),
+    ViewConfig: ({}, {
+        "cells": (0, 12, NAN), "resolution": (0.0, NAN), "map_resolution": (-1.0,), "beams": (0,), "fov_min": (0.0,),
+        "reach_min": (INF,),
+    }),
+    PFNetConfig: ({}, {
+        "width": (0,), "features": (0,), "alpha": (0.0, 1.5), "min_xy": (-0.1,), "min_theta": (NAN,),
+    }),
+    PFRNNConfig: ({}, {"hidden": (0, 1.5), "alpha": (0.0, NAN), "step_xy": (0.0,), "step_theta": (-1.0,)}),
+    SequenceConfig: ({}, {
+        "beam_step": (0,), "drives": (0,), "window": (1, 141), "obstacles": (-1,), "removed": (0.5,), "noise": (-0.1,),
+        "dropout": (1.5,), "short": (NAN,),
+    }),
+    FilterTrainConfig: ({}, {
+        "batch": (0,), "particles": (0,), "start_xy": ((2.0, 1.0), (-1.0, 1.0)), "start_theta": ((1.0,),),
+        "strays": (1.0, NAN), "heading_weight": (-1.0,), "particle_xy": (0.0,), "learning_rate": (0.0,),
+        "warmup": (-1,), "ema": (1.0,), "seed": (-1,),
     }),
 }  # fmt: skip
 CASES = [

@@ -17,8 +17,8 @@ LAYERS = (
     ("motion", "sensor", "nn", "simulate"),
     ("proposals", "metrics", "statistics", "run_table"),
     ("filters", "training", "montecarlo"),
-    ("data", "checkpoint", "run_folder", "plotting", "report", "judging"),
-    ("cli", "train", "bench", "localize", "evaluate"),
+    ("data", "checkpoint", "run_folder", "trained", "plotting", "report", "judging"),
+    ("cli", "trainer", "train", "train_filter", "bench", "localize", "evaluate"),
 )
 DEVICE = 5
 """Layers below this are device code."""

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dsom_jax import resampling
-from dsom_jax.resampling import pick, pick_in_rows
+from dsom_jax.resampling import pick, pick_in_rows, soft_resample
 
 SCHEMES = ["systematic", "multinomial"]
 resample = jax.jit(resampling.resample, static_argnums=(2, 3))
@@ -104,3 +104,57 @@ def test_picking_in_rows_is_picking_in_each_row(seed, width):
     alone = [int(pick(cumulative[row], position)) for row, position in zip(rows, positions, strict=True)]
     assert found.tolist() == alone
     assert (weights[rows, np.asarray(found)] > 0).all()
+
+
+WEIGHTS = np.array([0.5, 0.3, 0.15, 0.05, 0.0])
+
+
+def draw_softly(alpha, draws=4000, method="systematic"):
+    """Ancestors and log weights (draws, 5)."""
+    with np.errstate(divide="ignore"):
+        logs = jnp.asarray(np.log(WEIGHTS), jnp.float32)
+    keys = jax.random.split(jax.random.key(3), draws)
+    drawn = jax.jit(jax.vmap(lambda key: soft_resample(key, logs, alpha, method)))(keys)
+    return (np.asarray(part) for part in drawn)
+
+
+@pytest.mark.parametrize("method", ["systematic", "multinomial"])
+def test_soft_resampling_draws_from_the_mixture(method):
+    ancestors, _ = draw_softly(0.5, method=method)
+    mixture = 0.5 * WEIGHTS + 0.1
+    counts = (ancestors[..., None] == np.arange(5)).sum(1)
+    # The standard error of a count is at most that of multinomial draws; five of them.
+    error = 5 * np.sqrt(5 * mixture * (1 - mixture) / len(counts))
+    assert (np.abs(counts.mean(0) - 5 * mixture) < error).all()
+    if method == "systematic":
+        assert (np.abs(counts - 5 * mixture) < 1).all()
+
+
+def test_soft_weights_are_unbiased():
+    ancestors, logs = draw_softly(0.5)
+    ratio = (WEIGHTS / (0.5 * WEIGHTS + 0.1))[ancestors]
+    np.testing.assert_allclose(np.exp(logs), ratio / ratio.sum(1, keepdims=True), atol=1e-6)
+    np.testing.assert_allclose(np.exp(logs).sum(1), 1.0, atol=1e-5)
+    # sum_i w_i / q_i [a_i = k] / n has the expectation w_k: importance weights before they are normalised.
+    shares = np.stack([(ratio * (ancestors == k)).mean(1) for k in range(5)], 1)
+    error = 5 * shares.std(0) / np.sqrt(len(shares))
+    assert (np.abs(shares.mean(0) - WEIGHTS) <= error + 1e-7).all()
+
+
+def test_hard_resampling_is_the_special_case():
+    ancestors, logs = draw_softly(1.0, draws=50)
+    np.testing.assert_allclose(np.exp(logs), 0.2, rtol=1e-5)
+    assert not (ancestors == 4).any()
+
+
+@pytest.mark.parametrize("alpha", [0.3, 1.0])
+def test_soft_weights_have_a_finite_gradient_which_hard_ones_lack(alpha):
+    logs = jnp.array([0.0, -1.0, -2.0, -30.0, -jnp.inf])
+
+    def estimate(logs):
+        ancestors, weights = soft_resample(jax.random.key(0), logs, alpha)
+        return (jnp.exp(weights) * jnp.arange(1.0, 6.0)[ancestors]).sum()
+
+    gradient = np.asarray(jax.grad(estimate)(logs))
+    assert np.isfinite(gradient).all()
+    assert (np.abs(gradient).max() > 1e-3) == (alpha < 1)

@@ -11,16 +11,16 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from dsom_jax import checkpoint as networks
 from dsom_jax import metrics, plotting, report
 from dsom_jax.cli import Advance, parse, progress_bar
 from dsom_jax.data.suite import Suite, load_suite
 from dsom_jax.episode import Episode
 from dsom_jax.errors import UserError, run_cli
-from dsom_jax.filters.methods import METHODS, STANDARD, build_filter, needs_checkpoint
+from dsom_jax.filters.methods import METHODS, STANDARD, build_filter, network_of
 from dsom_jax.montecarlo import Result, run, run_keys, signature
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.run_table import RunTable, join, run_rows
+from dsom_jax.trained import by_kind, check_networks, check_used, find_networks, load_networks
 from dsom_jax.types import Filter, Key, Proposal
 
 ESTIMATES = ("mean", "cluster")
@@ -38,8 +38,8 @@ class Args:
     suite: str = "synthetic-v1"
     """Name of a suite, or a TOML file that describes one."""
     methods: str = ""
-    """Comma-separated method names; default: the eight of the standard comparison (not the hybrids), without
-    those that need a network where none is shipped."""
+    """Comma-separated method names; default: the eight of the standard comparison (not the hybrids, PF-Net and PFRNN),
+    without those that need a network where none is shipped."""
     particles: int = 200
     """Particles per run."""
     t_cut: float = 0.6
@@ -52,6 +52,10 @@ class Args:
     """Folder of a trained DSOM; default: the one in the repository."""
     per_run: bool = False
     """Write runs.npz, too: steps, final errors and retention of every single run, for paired comparisons."""
+    pf_net: Path | None = None
+    """Folder of a trained PF-Net; default: the one in the repository."""
+    pfrnn: Path | None = None
+    """Folder of a trained PFRNN; default: the one in the repository."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +111,10 @@ def benchmark(
     progress: Advance | None = None,
     checkpoint: Any = None,
 ) -> dict[str, Any]:
-    """The contents of ``bench.json``; ``progress(method, sequence)`` is called before each drive."""
+    """The contents of ``bench.json``; ``progress(method, sequence)`` is called before each drive.
+
+    ``checkpoint`` is a network, or networks by kind, as for :func:`collect`.
+    """
     settings = Settings(runs, particles, t_cut, seed)
     return summary(suite, collect(suite, methods, settings, progress, checkpoint), settings)
 
@@ -115,14 +122,19 @@ def benchmark(
 def collect(
     suite: Suite, methods: Sequence[str], settings: Settings, progress: Advance | None = None, checkpoint: Any = None
 ) -> dict[str, Record]:
-    """Run every method on every sequence; run r of a sequence has the same key for all methods."""
-    check_methods(methods, checkpoint)
+    """Run every method on every sequence; run r of a sequence has the same key for all methods.
+
+    ``checkpoint`` is a DSOM, or a mapping of networks by kind (``dsom``, ``pf_net``, ``pfrnn``).
+    """
+    trained = by_kind(checkpoint)
+    check_methods(methods, trained)
 
     sources: dict[str, dict[str, Proposal]] = {where: {} for where, _, _ in suite.episodes}
 
     def build(name: str, where: str, grid: OccupancyGrid, episode: Episode) -> Filter:
-        own = {"particles": settings.particles, "t_cut": settings.t_cut, "episode": episode, "checkpoint": checkpoint}
-        filter = build_filter(name, grid, suite.lidar, **own, sources=sources[where])
+        own: dict[str, Any] = {"particles": settings.particles, "t_cut": settings.t_cut, "episode": episode}
+        network = trained.get(network_of(name) or "")
+        filter = build_filter(name, grid, suite.lidar, **own, checkpoint=network, sources=sources[where])
         return jax.block_until_ready(filter)
 
     keys = [run_keys(settings.seed, number, settings.runs) for number in range(len(suite.episodes))]
@@ -134,26 +146,15 @@ def check_methods(methods: Sequence[str], checkpoint: Any = None) -> None:
     unknown = [name for name in methods if name not in METHODS]
     if unknown or not methods:
         raise UserError(f"--methods: unknown {', '.join(unknown) or '(none)'}; choose from {', '.join(METHODS)}")
-    untrained = [name for name in methods if needs_checkpoint(name) and checkpoint is None]
-    if untrained:
-        raise UserError(f"--checkpoint: {', '.join(untrained)} needs a trained network; name its folder")
+    check_networks(methods, by_kind(checkpoint))
 
 
-def chosen_methods(names: str, checkpoint: Path | None) -> tuple[str, ...]:
+def chosen_methods(names: str, checkpoint: Any) -> tuple[str, ...]:
     """The methods of a comma-separated list; an empty one means the standard ones that can be run."""
     methods = tuple(dict.fromkeys(name.strip() for name in names.split(",") if name.strip()))
-    methods = methods or tuple(name for name in STANDARD if checkpoint or not needs_checkpoint(name))
+    methods = methods or tuple(name for name in STANDARD if network_of(name) is None or by_kind(checkpoint).get("dsom"))
     check_methods(methods, checkpoint)
     return methods
-
-
-def check_checkpoint(args: Args, methods: Sequence[str]) -> None:
-    """UserError for a network that is named and that no method draws from."""
-    if args.checkpoint and not any(map(needs_checkpoint, methods)):
-        raise UserError(
-            f"--checkpoint {args.checkpoint}: has no use with --methods {','.join(methods)}; "
-            f"leave it out, or add one of {', '.join(filter(needs_checkpoint, METHODS))}"
-        )
 
 
 def run_method(name: str, suite: Suite, keys: Sequence[Key], build: Build, progress: Advance | None = None) -> Record:
@@ -270,15 +271,16 @@ def main() -> None:
     if args.per_run and not args.out:
         raise UserError("--per-run: give --out, the folder for runs.npz")
     settings = Settings(args.runs, args.particles, args.t_cut, args.seed)
-    checkpoint = args.checkpoint or networks.shipped()
-    methods = chosen_methods(args.methods, checkpoint)
-    check_checkpoint(args, methods)
+    asked = {"dsom": args.checkpoint, "pf_net": args.pf_net, "pfrnn": args.pfrnn}
+    folders = find_networks(asked)
+    methods = chosen_methods(args.methods, folders)
+    check_used(asked, methods)
     suite = load_suite(args.suite)
-    network = networks.load(checkpoint, suite.lidar) if checkpoint and any(map(needs_checkpoint, methods)) else None
+    trained = load_networks(folders, methods, suite.lidar)
     folder = report.output_folder(args.out) if args.out else None
     bar, advance = progress_bar(len(methods) * len(suite.episodes))
     with bar:
-        records = collect(suite, methods, settings, advance, network)
+        records = collect(suite, methods, settings, advance, trained)
     data = summary(suite, records, settings)
     report.print_tables(data)
     if folder:

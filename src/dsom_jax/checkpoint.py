@@ -22,7 +22,8 @@ from flax import nnx
 
 from dsom_jax.errors import UserError
 from dsom_jax.lidar import LidarConfig
-from dsom_jax.nn import DSOM, DSOMConfig, create, evaluation_view
+from dsom_jax.nn import KINDS, evaluation_view, kind_of
+from dsom_jax.training.options import override
 
 T = TypeVar("T")
 PROVENANCE = "provenance.json"
@@ -31,22 +32,24 @@ SHIPPED = Path(__file__).parents[2] / "checkpoints" / "dsom"
 """The network in the repository that this package runs from; not there once it is installed elsewhere."""
 
 
-def shipped() -> Path | None:
-    """The folder of the network that comes with the repository, if there is one."""
-    return SHIPPED if (SHIPPED / PROVENANCE).is_file() else None
+def shipped(kind: str = "dsom") -> Path | None:
+    """The folder of the network of that kind that comes with the repository, if there is one."""
+    folder = SHIPPED.with_name(kind.replace("_", "-"))
+    return folder if (folder / PROVENANCE).is_file() else None
 
 
-def save(directory: str | Path, model: DSOM, provenance: dict[str, Any] | None = None, tag: str = "weights") -> None:
+def save(directory: str | Path, model: Any, provenance: dict[str, Any] | None = None, tag: str = "weights") -> None:
     """Write ``model`` as a checkpoint, replacing an older one in the same folder in one atomic step.
 
     Args:
         directory: the checkpoint's folder, made if it does not exist.
-        model: training mode or evaluation view.
+        model: a network of :data:`dsom_jax.nn.KINDS`; of a DSOM the training mode or the evaluation view.
         provenance: JSON-able facts to keep: seed, commit, data, metrics.
         tag: name of the folder of the weights; must differ from that of the checkpoint replaced.
     """
     directory = Path(directory).absolute()
-    record = {"format": FORMAT, "model": asdict(model.config), "weights": tag, "packages": packages()}
+    what = {"kind": kind_of(model.config), "model": asdict(model.config)}
+    record = {"format": FORMAT, **what, "weights": tag, "packages": packages()}
     try:
         directory.mkdir(parents=True, exist_ok=True)
         _save_tree(directory / tag, _weights(model))
@@ -58,28 +61,32 @@ def save(directory: str | Path, model: DSOM, provenance: dict[str, Any] | None =
             shutil.rmtree(old, ignore_errors=True)
 
 
-def load(directory: str | Path, lidar: LidarConfig | None = None, resolution: float | None = None) -> DSOM:
-    """The network of a checkpoint as an evaluation view.
+def load(
+    directory: str | Path, lidar: LidarConfig | None = None, resolution: float | None = None, kind: str = "dsom"
+) -> Any:
+    """The network of a checkpoint, a DSOM as an evaluation view.
 
     Args:
         directory: of the checkpoint.
         lidar: refuse a network that was not trained for such scans.
         resolution: refuse a network for another scale, metres per cell.
+        kind: refuse any other network; a name of :data:`dsom_jax.nn.KINDS`.
     """
-    record = load_provenance(directory)
-    config = _model_config(Path(directory), record)
+    record = load_provenance(directory, kind)
+    config = _model_config(Path(directory), record, kind)
     _check_fit(Path(directory), config, lidar, resolution)
-    abstract = nnx.eval_shape(lambda: create(config))
+    abstract = nnx.eval_shape(lambda: KINDS[kind].create(config))
     weights = _load_tree(Path(directory).absolute() / str(record["weights"]), _weights(abstract))
     graphdef = nnx.split(abstract, nnx.Param, nnx.BatchStat)[0]
-    return evaluation_view(nnx.merge(graphdef, weights["params"], weights["stats"]))
+    model = nnx.merge(graphdef, weights["params"], weights["stats"])
+    return evaluation_view(model) if kind == "dsom" else model
 
 
-def load_provenance(directory: str | Path) -> dict[str, Any]:
-    """The facts of a checkpoint: what it is, and what it was trained with and on."""
+def load_provenance(directory: str | Path, kind: str = "dsom") -> dict[str, Any]:
+    """The facts of a checkpoint of that kind: what it is, and what it was trained with and on."""
     path = Path(directory) / PROVENANCE
     if not path.is_file():
-        raise UserError(f"{path}: no such file; give a folder written by `python -m dsom_jax.train --out`")
+        raise UserError(f"{path}: no such file; give a folder written by `python -m {KINDS[kind].command} --out`")
     try:
         record = json.loads(path.read_text())
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
@@ -89,6 +96,9 @@ def load_provenance(directory: str | Path) -> dict[str, Any]:
     for name in ("model", "weights"):
         if name not in record:
             raise UserError(f"{path}: field {name} is missing; restore the file or train again")
+    held = record.get("kind", "dsom")
+    if held != kind:
+        raise UserError(f"{path}: field kind is {held}, but a {kind} is needed; give the folder of one")
     return record
 
 
@@ -117,7 +127,7 @@ def packages() -> dict[str, str]:
     return {name: version(name) for name in ("jax", "flax", "optax", "orbax-checkpoint", "numpy")}
 
 
-def _weights(model: DSOM) -> dict[str, Any]:
+def _weights(model: Any) -> dict[str, Any]:
     parts: Any = nnx.split(model, nnx.Param, nnx.BatchStat)
     _, params, stats = parts
     return {"params": nnx.to_pure_dict(params), "stats": nnx.to_pure_dict(stats)}
@@ -154,19 +164,16 @@ def _first_line(error: Exception) -> str:
     return (str(error).strip().splitlines() or [type(error).__name__])[0][:120]
 
 
-def _model_config(directory: Path, record: dict[str, Any]) -> DSOMConfig:
-    known = {field.name for field in fields(DSOMConfig)}
+def _model_config(directory: Path, record: dict[str, Any], kind: str) -> Any:
+    known = {field.name for field in fields(KINDS[kind].config)}
     path = directory / PROVENANCE
     model = record["model"]
     if not isinstance(model, dict) or set(model) - known:
         raise UserError(f"{path}: field model does not describe a network of this version; train again")
-    try:
-        return DSOMConfig(**model)
-    except (TypeError, ValueError) as error:
-        raise UserError(f"{path}: field model: {error}") from error
+    return override(KINDS[kind].config(), model, f"{path}: field model")
 
 
-def _check_fit(directory: Path, config: DSOMConfig, lidar: LidarConfig | None, resolution: float | None) -> None:
+def _check_fit(directory: Path, config: Any, lidar: LidarConfig | None, resolution: float | None) -> None:
     misfit = config.misfit(lidar) if lidar is not None else None
     if misfit:
         raise UserError(f"{directory}: does not fit the lidar: {misfit}; train for it or use another proposal")

@@ -48,3 +48,18 @@ def positions(key: Key, n: int, method: Resampling) -> Array:
 def resample(key: Key, weights: Array, n: int, method: Resampling = "systematic") -> Array:
     """(n,) ancestors drawn by ``weights`` (m,), which need not be normalised (Probabilistic Robotics, table 4.4)."""
     return pick(jnp.cumsum(weights), positions(key, n, method))
+
+
+def soft_resample(key: Key, log_weights: Array, alpha: float, method: Resampling = "systematic") -> tuple[Array, Array]:
+    """Ancestors (n,) drawn from q = alpha w + (1 - alpha) / n, and their log weights (n,), proportional to w / q.
+
+    PF-Net, Karkus et al. 2018, section 4: unlike weights that resampling makes equal, these have a gradient.
+    ``log_weights`` (n,) need not be normalised; those returned are.
+    """
+    n = log_weights.shape[0]
+    log_weights = jax.nn.log_softmax(log_weights)
+    mixture = alpha * jnp.exp(log_weights) + (1 - alpha) / n
+    ancestors = resample(key, jax.lax.stop_gradient(mixture), n, method)
+    # For alpha = 1 a particle of no weight is never drawn, but its 0 / 0 would be everybody's gradient.
+    ratio = log_weights - jnp.log(jnp.maximum(mixture, jnp.finfo(mixture.dtype).tiny))
+    return ancestors, jax.nn.log_softmax(ratio[ancestors])

@@ -5,23 +5,30 @@ from __future__ import annotations
 import json
 import shutil
 import subprocess
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+import yaml
 
 from dsom_jax import checkpoint
-from dsom_jax.training.loop import TrainConfig, TrainState, averaged_model, late_start
+from dsom_jax.errors import UserError
+from dsom_jax.training.filter_loop import averaged_filter_model
+from dsom_jax.training.loop import averaged_model, late_start
+
+R = TypeVar("R", bound="Run")
 
 
 @dataclass
 class Run:
-    """A training run and its folder: state-*/ (to resume), metrics.jsonl, run.json, and the checkpoint itself.
+    """A training run of DSOM and its folder: state-*/ (to resume), metrics.jsonl, run.json, and the checkpoint itself.
 
     ``commit`` is that of the code when this process began, whatever happens to the repository while it trains.
     """
 
     out: Path
-    config: TrainConfig
+    config: Any
     maps: tuple[str, ...]
     total: int | None
     seconds: float = 0.0
@@ -41,23 +48,30 @@ class Run:
         """Folders of complete states, oldest first."""
         return sorted(p for p in self.out.glob("state-*") if p.name[6:].isdigit())
 
-    def save(self, state: TrainState, metrics: dict[str, Any]) -> None:
+    def save(self, state: Any, metrics: dict[str, Any]) -> None:
         """State and checkpoint; the two newest states stay."""
         step = int(state.step)
         checkpoint.save_state(self.out / f"state-{step:08d}", state)
         self.write()
-        model, tag = averaged_model(self.config, state), f"weights-{step:08d}"
-        checkpoint.save(self.out, model, self.provenance(step, metrics), tag)
+        tag = f"weights-{step:08d}"
+        checkpoint.save(self.out, self.model(state), self.provenance(step, metrics), tag)
         for old in self.states()[:-2]:
             shutil.rmtree(old, ignore_errors=True)
 
+    def model(self, state: Any) -> Any:
+        """The network that is shipped."""
+        return averaged_model(self.config, state)
+
+    def data(self) -> list[str] | str:
+        """What is trained on."""
+        return [Path(path).name for path in self.maps] or "procedural buildings, dsom_jax.simulate.make_world"
+
     def provenance(self, step: int, metrics: dict[str, Any]) -> dict[str, Any]:
         """How the weights came about."""
-        data = [Path(path).name for path in self.maps] or "procedural buildings, dsom_jax.simulate.make_world"
         facts = {
             "seed": self.config.seed,
-            "commit": commit(),
-            "data": data,
+            "commit": self.commit,
+            "data": self.data(),
             "init": self.init,
             "steps": step,
             "total": self.total,
@@ -70,6 +84,71 @@ class Run:
         early, late = self.config.early, self.config.late
         start = step if self.total is None else min(step, late_start(self.config, self.total))
         return start * early.worlds * early.scans + (step - start) * late.worlds * late.scans
+
+
+@dataclass
+class FilterRun(Run):
+    """A training run of PF-Net or PFRNN; without ``maps``, on the test maps of the frozen suite."""
+
+    def model(self, state: Any) -> Any:
+        """The network that is shipped."""
+        return averaged_filter_model(self.config, state)
+
+    def data(self) -> list[str] | str:
+        """What is trained on."""
+        return [Path(path).name for path in self.maps] or "random drives in the test maps of synthetic-v1"
+
+    def samples(self, step: int) -> int:
+        """Scans seen after ``step`` steps."""
+        return step * self.config.batch * self.config.data.window
+
+
+def read_yaml(path: Path | None) -> Any:
+    """Contents of a configuration file; nothing without one."""
+    if path is None:
+        return {}
+    try:
+        return yaml.safe_load(path.read_text()) or {}
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise UserError(f"{path}: cannot read the configuration ({error}); give a YAML file") from error
+
+
+def create(run: Run) -> None:
+    """The folder of a new run with its run.json."""
+    try:
+        run.out.mkdir(parents=True, exist_ok=True)
+        run.write()
+    except OSError as error:
+        raise UserError(f"{run.out}: cannot write ({error.strerror}); give another --out") from error
+
+
+def check_new(out: Path, resume: bool) -> None:
+    """UserError if the folder of a run that is to begin is a file, or (unless ``resume``) not empty."""
+    if out.exists() and not out.is_dir():
+        raise UserError(f"--out {out}: is a file; give a folder")
+    if not resume and out.exists() and any(out.iterdir()):
+        raise UserError(f"{out}: not empty; add --resume to continue that run, or give another --out")
+
+
+def reopen(
+    kind: type[R], path: Path, read_config: Callable[[Any], Any], maps: tuple[Path, ...], steps: int | None
+) -> R:
+    """The run that the ``run.json`` at ``path`` describes; ``read_config`` makes its configuration of what it holds.
+
+    UserError if it is another than ``maps`` and ``steps``, where given, ask for.
+    """
+    try:
+        record = json.loads(path.read_text())
+        config = read_config(record["config"])
+        rest = (tuple(record["maps"]), record["total"], record["seconds"], record.get("init"))
+        run = kind(path.parent, config, *rest)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UserError(f"{path}: no run to resume here ({error}); start without --resume") from error
+    if maps and tuple(map(str, maps)) != run.maps:
+        raise UserError(f"--maps: the run in {path} has {', '.join(run.maps) or 'none'}; resume without --maps")
+    if steps is not None and run.total is not None and steps != run.total:
+        raise UserError(f"--steps {steps}: the run in {path} has {run.total}; resume without --steps")
+    return run
 
 
 def commit() -> str:

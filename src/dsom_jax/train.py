@@ -2,30 +2,24 @@
 
 from __future__ import annotations
 
-import json
-import math
-import time
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
-import yaml
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from dsom_jax import checkpoint
 from dsom_jax.cli import parse
 from dsom_jax.errors import UserError, run_cli
 from dsom_jax.nn import DSOM
 from dsom_jax.occupancy import OccupancyGrid, resample
-from dsom_jax.run_folder import Run, trim_log
+from dsom_jax.run_folder import Run, check_new, create, read_yaml, reopen
+from dsom_jax.trainer import Parts, check_length, train
 from dsom_jax.training.batches import make_batch, plain
 from dsom_jax.training.evaluation import make_evaluation
 from dsom_jax.training.loop import (
     TrainConfig,
     TrainState,
-    averaged_model,
     init_state,
     make_batches,
     make_step,
@@ -34,8 +28,6 @@ from dsom_jax.training.loop import (
 from dsom_jax.training.memory import keep_freed_memory
 from dsom_jax.training.options import override
 from dsom_jax.training.sharding import data_mesh, replicate, spread
-
-CALIBRATION_STEPS = 30
 
 
 @dataclass(frozen=True)
@@ -65,14 +57,7 @@ class Arguments:
     save_steps: int | None = None
 
     def __post_init__(self) -> None:
-        if self.steps is not None and self.steps < 1:
-            raise UserError(f"--steps {self.steps}: give at least one step")
-        if self.steps is None and not 0 < self.minutes < math.inf:
-            raise UserError(f"--minutes {self.minutes}: give a positive time")
-        if not self.save_minutes > 0:
-            raise UserError(f"--save-minutes {self.save_minutes}: give a positive time")
-        if self.save_steps is not None and self.save_steps < 1:
-            raise UserError(f"--save-steps {self.save_steps}: give at least one step")
+        check_length(self)
 
 
 class Material(NamedTuple):
@@ -84,13 +69,7 @@ class Material(NamedTuple):
 
 def read_config(path: Path | None) -> TrainConfig:
     """TrainConfig from a YAML file with some of its fields."""
-    if path is None:
-        return TrainConfig()
-    try:
-        given = yaml.safe_load(path.read_text()) or {}
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise UserError(f"{path}: cannot read the configuration ({error}); give a YAML file") from error
-    return override(TrainConfig(), given, str(path))
+    return override(TrainConfig(), read_yaml(path), str(path))
 
 
 def load_maps(paths: tuple[Path, ...], resolution: float) -> list[OccupancyGrid]:
@@ -110,19 +89,12 @@ def open_run(args: Arguments) -> tuple[Run, Material]:
     if args.resume and path.exists():
         run = resume_run(args, path)
         return run, read_material(args, run)
-    if args.out.exists() and not args.out.is_dir():
-        raise UserError(f"--out {args.out}: is a file; give a folder")
-    if not args.resume and args.out.exists() and any(args.out.iterdir()):
-        raise UserError(f"{args.out}: not empty; add --resume to continue that run, or give another --out")
+    check_new(args.out, args.resume)
     begin = None if args.init is None else args.init.name
     run = Run(args.out, read_config(args.config), tuple(str(p) for p in args.maps), args.steps, init=begin)
     # Before anything is written: a bad map or checkpoint leaves no folder behind.
     material = read_material(args, run)
-    try:
-        args.out.mkdir(parents=True, exist_ok=True)
-        run.write()
-    except OSError as error:
-        raise UserError(f"{args.out}: cannot write ({error.strerror}); give another --out") from error
+    create(run)
     return run, material
 
 
@@ -134,18 +106,9 @@ def read_material(args: Arguments, run: Run) -> Material:
 
 def resume_run(args: Arguments, path: Path) -> Run:
     """The run described by run.json."""
-    try:
-        record = json.loads(path.read_text())
-        config = override(TrainConfig(), record["config"], str(path))
-        run = Run(args.out, config, tuple(record["maps"]), record["total"], record["seconds"], record.get("init"))
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UserError(f"{path}: no run to resume here ({error}); start without --resume") from error
-    if args.maps and tuple(map(str, args.maps)) != run.maps:
-        raise UserError(f"--maps: the run in {path} has {', '.join(run.maps) or 'none'}; resume without --maps")
-    if args.config is not None and read_config(args.config) != config:
+    run = reopen(Run, path, lambda given: override(TrainConfig(), given, str(path)), args.maps, args.steps)
+    if args.config is not None and read_config(args.config) != run.config:
         raise UserError(f"{args.config}: differs from the run in {path}; resume without --config")
-    if args.steps is not None and run.total is not None and args.steps != run.total:
-        raise UserError(f"--steps {args.steps}: the run in {path} has {run.total}; resume without --steps")
     return run
 
 
@@ -177,78 +140,16 @@ def held_out(run: Run, grids: list[OccupancyGrid]) -> Any:
     return make_evaluation(batch, scans.lidar)
 
 
-class Trainer:
-    """The Python loop around the jitted step."""
-
-    def __init__(self, args: Arguments, run: Run, material: Material) -> None:
-        self.args, self.run = args, run
-        self.mesh = data_mesh()
-        make = make_batches(run.config, material.grids)
-        self.batches = lambda step, total: spread(make(step, total), self.mesh)
-        self.step = make_step(run.config)
-        self.evaluate = held_out(run, material.grids)
-        self.state = replicate(first_state(run, material.network), self.mesh)
-        self.saved_at = time.monotonic()
-        self.clock = time.monotonic()
-        trim_log(run.out / "metrics.jsonl", int(self.state.step))
-
-    def train(self, progress: Progress) -> dict[str, Any]:
-        """Steps until the end; returns the last evaluation."""
-        first = done = int(self.state.step)
-        task = progress.add_task("training", total=self.run.total, completed=done, note="compiling")
-        batch = self.batches(done, self.total())
-        with (self.run.out / "metrics.jsonl").open("a") as log:
-            while done < self.total():
-                self.state, metrics = self.step(self.state, batch, jnp.int32(self.total()))
-                done += 1
-                # The next batch is made while the step runs.
-                batch = self.batches(done, self.total())
-                values = {name: float(value) for name, value in metrics.items()}
-                rate = self.tick(done - first)
-                log.write(json.dumps({"step": done, **values, "seconds": round(self.run.seconds, 3)}) + "\n")
-                log.flush()
-                note = f"loss {values['total']:.3f}  KLD {values['kld']:.3f}  {rate:.0f} samples/s"
-                progress.update(task, completed=done, total=self.run.total, note=note)
-                if self.due(done):
-                    self.save(progress)
-        return self.save(progress)
-
-    def total(self) -> int:
-        """Steps of the run; far away until calibrated."""
-        return self.run.total or 2**30
-
-    def tick(self, count: int) -> float:
-        """Account for the time of a step; with ``minutes`` decide on the number of steps. Returns samples/s."""
-        now = time.monotonic()
-        spent, self.clock = now - self.clock, now
-        self.run.seconds += spent
-        if self.run.total is None:
-            self.calibrate(count, now)
-        return self.run.config.early.worlds * self.run.config.early.scans / max(spent, 1e-9)
-
-    def calibrate(self, count: int, now: float) -> None:
-        """Number of steps that fit the minutes given, from the steps after compilation."""
-        if count == 5:
-            self.calibration_start = now
-        elif count == 5 + CALIBRATION_STEPS:
-            per_step = (now - self.calibration_start) / CALIBRATION_STEPS
-            left = 60 * self.args.minutes * 0.95 - self.run.seconds
-            self.run.total = max(count + int(left / per_step), count + 1)
-            self.run.write()
-
-    def due(self, done: int) -> bool:
-        """Whether to save now."""
-        if self.args.save_steps is not None:
-            return done % self.args.save_steps == 0
-        return time.monotonic() - self.saved_at > 60 * self.args.save_minutes
-
-    def save(self, progress: Progress) -> dict[str, Any]:
-        """Evaluate and save; the time it takes is not training time of a step but counts for the run."""
-        scores = self.evaluate(averaged_model(self.run.config, self.state))
-        self.run.save(self.state, scores)
-        progress.console.print(f"step {int(self.state.step)}: " + json.dumps(scores))
-        self.saved_at = time.monotonic()
-        return scores
+def parts(run: Run, material: Material) -> Parts:
+    """Batches, step and evaluation of a run."""
+    mesh, make = data_mesh(), make_batches(run.config, material.grids)
+    return Parts(
+        batches=lambda step, total: spread(make(step, total), mesh),
+        step=make_step(run.config),
+        evaluate=held_out(run, material.grids),
+        state=replicate(first_state(run, material.network), mesh),
+        shown=("kld", "KLD"),
+    )
 
 
 def main() -> None:
@@ -256,9 +157,7 @@ def main() -> None:
     args = parse(Arguments, "python -m dsom_jax.train")
     keep_freed_memory()
     run, material = open_run(args)
-    columns = (TextColumn("{task.completed} / {task.total}"), BarColumn(), TextColumn("{task.fields[note]}"))
-    with Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn()) as progress:
-        Trainer(args, run, material).train(progress)
+    train(args, run, lambda: parts(run, material))
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -14,6 +15,8 @@ from dsom_jax.filters.adam_memory import AdamMemory
 from dsom_jax.filters.adam_robust import AdamRobust, RobustConfig
 from dsom_jax.filters.mcl import MCL
 from dsom_jax.filters.mixture import MixtureMCL
+from dsom_jax.filters.pf_net import pf_net
+from dsom_jax.filters.pfrnn import pfrnn
 from dsom_jax.filters.updates import FilterConfig, World
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.motion import OdometryMotion
@@ -42,16 +45,20 @@ COMBINATIONS: dict[str, tuple[Algorithm, str]] = {
     "robust_likelihood_grid": ("adam_robust", "likelihood_grid"),
     "robust_hybrid": ("adam_robust", "hybrid"),
 }
+LEARNED: dict[str, Callable[..., Filter]] = {"pf_net": pf_net, "pfrnn": pfrnn}
+"""Filters that are networks themselves; each has the name of its kind of network."""
 _STAR = "_star"
 PARTS = {"hybrid": ("likelihood_grid", "dsom")}
-METHODS: tuple[str, ...] = tuple(COMBINATIONS)
-STANDARD: tuple[str, ...] = tuple(name for name in METHODS if COMBINATIONS[name][1] not in PARTS)
+METHODS: tuple[str, ...] = (*COMBINATIONS, *LEARNED)
+STANDARD: tuple[str, ...] = tuple(name for name, (_, proposal) in COMBINATIONS.items() if proposal not in PARTS)
 """Methods of the standard comparison; the others have to be asked for by name."""
 
 
-def needs_checkpoint(method: str) -> bool:
-    """Whether a method of :data:`METHODS` draws from a trained network."""
-    return COMBINATIONS[method][1].endswith(("dsom", "hybrid"))
+def network_of(method: str) -> str | None:
+    """Kind of the trained network that a method of :data:`METHODS` needs: ``dsom``, ``pf_net``, ``pfrnn`` or none."""
+    if method in LEARNED:
+        return method
+    return "dsom" if COMBINATIONS[method][1].endswith(("dsom", "hybrid")) else None
 
 
 @dataclass(frozen=True)
@@ -132,9 +139,12 @@ def build_filter(
 ) -> Filter:
     """Filter ``name`` of :data:`METHODS` as the benchmark runs it.
 
-    ``episode`` is needed by ``mixture_mcl_star`` only; ``checkpoint`` is an evaluation view of a DSOM; ``sources``
-    holds the proposals that were made for this map before, by name: what is missing is made and put there.
+    ``episode`` is needed by ``mixture_mcl_star`` only; ``checkpoint`` is the network that :func:`network_of` names, a
+    DSOM as an evaluation view; ``sources`` holds the proposals that were made for this map before, by name: what is
+    missing is made and put there.
     """
+    if name in LEARNED:
+        return LEARNED[name](checkpoint, grid, lidar, particles)
     algorithm, proposal = COMBINATIONS[name]
     settings = Settings(particles=particles, t_cut=t_cut)
     sources, base = {} if sources is None else sources, proposal.removesuffix(_STAR)

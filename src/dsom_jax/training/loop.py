@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -121,12 +121,28 @@ class TrainState(NamedTuple):
     average: Any
 
 
-def optimizer(config: TrainConfig) -> optax.GradientTransformation:
+class Schedule(Protocol):
+    """The part of a configuration that says how to descend; every kind of network has it."""
+
+    @property
+    def learning_rate(self) -> float:
+        """Peak of Adam's rate."""
+
+    @property
+    def warmup(self) -> int:
+        """Steps to the peak."""
+
+    @property
+    def clip(self) -> float:
+        """Largest norm of the gradient."""
+
+
+def optimizer(config: Schedule) -> optax.GradientTransformation:
     """Clip and Adam; the rate is applied by the step because the number of steps is not static."""
     return optax.chain(optax.clip_by_global_norm(config.clip), optax.scale_by_adam())
 
 
-def learning_rate(config: TrainConfig, step: Array, total: Array) -> Array:
+def learning_rate(config: Schedule, step: Array, total: Array) -> Array:
     """Linear warm-up, then half a cosine down to zero at ``total``."""
     progress = jnp.clip((step - config.warmup) / jnp.maximum(total - config.warmup, 1), 0.0, 1.0)
     warm = jnp.minimum((step + 1) / max(config.warmup, 1), 1.0)

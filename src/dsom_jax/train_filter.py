@@ -1,0 +1,134 @@
+"""``python -m dsom_jax.train_filter``: train PF-Net or PFRNN on sequences in the maps that they are to be used in."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+
+from dsom_jax import checkpoint
+from dsom_jax.cli import parse
+from dsom_jax.data.suite import load_suite
+from dsom_jax.errors import UserError, run_cli
+from dsom_jax.nn import KINDS
+from dsom_jax.occupancy import OccupancyGrid
+from dsom_jax.run_folder import FilterRun, Run, check_new, create, read_yaml, reopen
+from dsom_jax.train import load_maps
+from dsom_jax.trainer import Parts, check_length, train
+from dsom_jax.training.filter_evaluation import make_tracking
+from dsom_jax.training.filter_loop import FilterTrainConfig, init_filter_state, make_filter_step, stack_maps
+from dsom_jax.training.memory import keep_freed_memory
+from dsom_jax.training.options import override
+from dsom_jax.training.sequences import make_windows, plan_paths
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Train PF-Net or PFRNN.
+
+    Attributes:
+        filter: which of the two.
+        config: YAML file with fields of FilterTrainConfig that differ from the defaults.
+        maps: map.yaml files to train in; default: the two test maps of synthetic-v1, as the paper trains its baselines.
+        minutes: time to train; the number of steps is set after the first few.
+        steps: number of steps, in place of minutes.
+        out: folder for the checkpoint, the training state and metrics.jsonl; default: runs/ and the filter's name.
+        resume: continue the run in the folder ``out``, or start it if there is none yet.
+        save_minutes: time between checkpoints.
+        save_steps: steps between checkpoints, in place of save_minutes.
+    """
+
+    filter: Literal["pf_net", "pfrnn"]
+    config: Path | None = None
+    maps: tuple[Path, ...] = ()
+    minutes: float = 20.0
+    steps: int | None = None
+    out: Path | None = None
+    resume: bool = False
+    save_minutes: float = 3.0
+    save_steps: int | None = None
+
+    def __post_init__(self) -> None:
+        check_length(self)
+
+    @property
+    def folder(self) -> Path:
+        """Where the run lives."""
+        return self.out or Path("runs") / self.filter.replace("_", "-")
+
+    def read_config(self, given: Any, where: str) -> FilterTrainConfig:
+        """The configuration of this filter with the fields of ``given``."""
+        return override(FilterTrainConfig(model=KINDS[self.filter].config()), given, where)
+
+
+def training_maps(paths: tuple[str, ...], resolution: float) -> list[OccupancyGrid]:
+    """Maps at the network's resolution, their frames at their lower-left corners."""
+    if paths:
+        return load_maps(tuple(Path(path) for path in paths), resolution)
+    tests = {name: grid for name, grid, _ in load_suite("synthetic-v1").episodes}
+    return list(tests.values())
+
+
+def open_run(args: Arguments) -> FilterRun:
+    """A new run in an empty folder, or the one to resume."""
+    path, out = args.folder / "run.json", args.folder
+    if args.resume and path.exists():
+        return resume_run(args, path)
+    check_new(out, args.resume)
+    config = args.read_config(read_yaml(args.config), str(args.config))
+    run = FilterRun(out, config, tuple(str(p) for p in args.maps), args.steps)
+    # Read once before anything is written: a bad map leaves no folder behind.
+    training_maps(run.maps, config.model.resolution)
+    create(run)
+    return run
+
+
+def resume_run(args: Arguments, path: Path) -> FilterRun:
+    """The run described by run.json; UserError if it is of another filter or configuration."""
+    run = reopen(FilterRun, path, lambda given: args.read_config(given, str(path)), args.maps, args.steps)
+    if args.config is not None and args.read_config(read_yaml(args.config), str(args.config)) != run.config:
+        raise UserError(f"{args.config}: differs from the run in {path}; resume without --config")
+    return run
+
+
+def first_state(run: Run) -> Any:
+    """The newest saved state, or a fresh one."""
+    fresh = init_filter_state(run.config)
+    return checkpoint.load_state(run.states()[-1], fresh) if run.states() else fresh
+
+
+def make_batches(run: Run, grids: list[OccupancyGrid]) -> tuple[Callable[[int, int], Any], Any]:
+    """(step, total) -> batch of that step, and the maps that are cropped."""
+    config, resolution = run.config, grids[0].resolution
+    pool, root = plan_paths(config.seed, grids, config.data), jax.random.key(config.seed + 1)
+    sizes = {"resolution": resolution, "count": config.batch, "strays": config.particles}
+
+    @jax.jit
+    def batch(step: jax.Array) -> Any:
+        return make_windows(jax.random.fold_in(root, step), pool, config.data, **sizes)
+
+    return lambda step, total: batch(jnp.int32(step)), stack_maps(pool, resolution)
+
+
+def parts(run: Run) -> Parts:
+    """Batches, step and evaluation of a run."""
+    grids = [replace(g, origin=jnp.zeros(3)) for g in training_maps(run.maps, run.config.model.resolution)]
+    batches, places = make_batches(run, grids)
+    step, evaluate = make_filter_step(run.config, places), make_tracking(run.config, grids)
+    return Parts(batches, step, evaluate, first_state(run), ("prediction", "prediction"))
+
+
+def main() -> None:
+    """Entry point."""
+    args = parse(Arguments, "python -m dsom_jax.train_filter")
+    keep_freed_memory()
+    run = open_run(args)
+    train(args, run, lambda: parts(run))
+
+
+if __name__ == "__main__":
+    run_cli(main)

@@ -1,0 +1,154 @@
+"""The loop around a jitted training step: progress, the clock, checkpoints; the same for every network."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+import jax.numpy as jnp
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from dsom_jax.errors import UserError
+from dsom_jax.run_folder import Run, trim_log
+
+CALIBRATION_STEPS = 30
+
+
+class Options(Protocol):
+    """Those arguments of a training command that the loop looks at."""
+
+    @property
+    def steps(self) -> int | None:
+        """Number of steps, in place of minutes."""
+
+    @property
+    def minutes(self) -> float:
+        """Time to train; the number of steps is set after the first few."""
+
+    @property
+    def save_minutes(self) -> float:
+        """Time between checkpoints."""
+
+    @property
+    def save_steps(self) -> int | None:
+        """Steps between checkpoints, in place of save_minutes."""
+
+
+class Parts(NamedTuple):
+    """What differs between networks.
+
+    Attributes:
+        batches: (step, total) -> batch, a function of seed and step alone.
+        step: (state, batch, total) -> (state, metrics), jitted.
+        evaluate: network -> numbers for the log and the provenance.
+        state: before the first step of this process, ``state.step`` says which.
+        shown: metric that is shown beside the total loss, and its name.
+    """
+
+    batches: Callable[[int, int], Any]
+    step: Callable[..., Any]
+    evaluate: Callable[[Any], dict[str, Any]]
+    state: Any
+    shown: tuple[str, str]
+
+
+def check_length(options: Options) -> None:
+    """UserError for a run of no length, or one that would never be saved."""
+    if options.steps is not None and options.steps < 1:
+        raise UserError(f"--steps {options.steps}: give at least one step")
+    if options.steps is None and not 0 < options.minutes < math.inf:
+        raise UserError(f"--minutes {options.minutes}: give a positive time")
+    if not options.save_minutes > 0:
+        raise UserError(f"--save-minutes {options.save_minutes}: give a positive time")
+    if options.save_steps is not None and options.save_steps < 1:
+        raise UserError(f"--save-steps {options.save_steps}: give at least one step")
+
+
+def train(options: Options, run: Run, make: Callable[[], Parts]) -> dict[str, Any]:
+    """Steps until the end with a progress bar; returns the last evaluation."""
+    columns = (TextColumn("{task.completed} / {task.total}"), BarColumn(), TextColumn("{task.fields[note]}"))
+    with Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn()) as progress:
+        return Trainer(options, run, make()).train(progress)
+
+
+class Trainer:
+    """The Python loop around the jitted step."""
+
+    def __init__(self, options: Options, run: Run, parts: Parts) -> None:
+        self.options, self.run, self.parts = options, run, parts
+        self.state = parts.state
+        self.saved_at = time.monotonic()
+        self.clock = time.monotonic()
+        trim_log(log_path(run), int(self.state.step))
+
+    def train(self, progress: Progress) -> dict[str, Any]:
+        """Steps until the end; returns the last evaluation."""
+        first = done = int(self.state.step)
+        task = progress.add_task("training", total=self.run.total, completed=done, note="compiling")
+        batch = self.parts.batches(done, self.total())
+        with log_path(self.run).open("a") as log:
+            while done < self.total():
+                self.state, metrics = self.parts.step(self.state, batch, jnp.int32(self.total()))
+                done += 1
+                # The next batch is made while the step runs.
+                batch = self.parts.batches(done, self.total())
+                values = {name: float(value) for name, value in metrics.items()}
+                spent = self.tick(done - first)
+                log.write(json.dumps({"step": done, **values, "seconds": round(self.run.seconds, 3)}) + "\n")
+                log.flush()
+                progress.update(task, completed=done, total=self.run.total, note=self.note(values, done, spent))
+                if self.due(done):
+                    self.save(progress)
+        return self.save(progress)
+
+    def note(self, values: dict[str, float], done: int, spent: float) -> str:
+        """Losses and speed, for the progress bar."""
+        metric, name = self.parts.shown
+        rate = (self.run.samples(done) - self.run.samples(done - 1)) / max(spent, 1e-9)
+        return f"loss {values['total']:.3f}  {name} {values[metric]:.3f}  {rate:.0f} samples/s"
+
+    def total(self) -> int:
+        """Steps of the run; far away until calibrated."""
+        return self.run.total or 2**30
+
+    def tick(self, count: int) -> float:
+        """Account for the time of a step; with ``minutes`` decide on the number of steps. Returns its seconds."""
+        now = time.monotonic()
+        spent, self.clock = now - self.clock, now
+        self.run.seconds += spent
+        if self.run.total is None:
+            self.calibrate(count, now)
+        return spent
+
+    def calibrate(self, count: int, now: float) -> None:
+        """Number of steps that fit the minutes given, from the steps after compilation."""
+        if count == 5:
+            self.calibration_start = now
+        elif count == 5 + CALIBRATION_STEPS:
+            per_step = (now - self.calibration_start) / CALIBRATION_STEPS
+            left = 60 * self.options.minutes * 0.95 - self.run.seconds
+            self.run.total = max(count + int(left / per_step), count + 1)
+            self.run.write()
+
+    def due(self, done: int) -> bool:
+        """Whether to save now."""
+        if self.options.save_steps is not None:
+            return done % self.options.save_steps == 0
+        return time.monotonic() - self.saved_at > 60 * self.options.save_minutes
+
+    def save(self, progress: Progress) -> dict[str, Any]:
+        """Evaluate and save; the time it takes is not training time of a step but counts for the run."""
+        scores = self.parts.evaluate(self.run.model(self.state))
+        self.run.save(self.state, scores)
+        progress.console.print(f"step {int(self.state.step)}: " + json.dumps(scores))
+        self.saved_at = time.monotonic()
+        return scores
+
+
+def log_path(run: Run) -> Path:
+    """One line of JSON for each step."""
+    return run.out / "metrics.jsonl"

@@ -1,0 +1,158 @@
+"""PF-Net and PFRNN as filters: their models by hand, their weights, and the promises of the runner."""
+
+from __future__ import annotations
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import tiny_world
+from dsom_jax import montecarlo
+from dsom_jax.filters.common import Info
+from dsom_jax.filters.learned import Prior
+from dsom_jax.filters.methods import LEARNED, METHODS, STANDARD, build_filter, network_of
+from dsom_jax.geometry import compose, relative, wrap_angle
+from dsom_jax.nn.view_net import ScanCode
+from dsom_jax.occupancy import is_free
+from learned_kit import KINDS, MODELS, PFRNN, VIEW, make, quick_compilation
+
+TRUTH = tiny_world.drive().poses[0]
+PRIOR = Prior(TRUTH, jnp.array([0.3, 0.3, 0.17]))
+
+quick = pytest.fixture(quick_compilation)
+
+
+@pytest.fixture(scope="module")
+def episode():
+    return jax.tree.map(lambda leaf: leaf[:4], tiny_world.drive())
+
+
+def inputs_at(episode, t):
+    return jax.tree.map(lambda leaf: leaf[t], episode.inputs)
+
+
+def test_motion_without_noise_is_exact(quick):
+    poses = jax.random.uniform(jax.random.key(0), (50, 3), minval=-3, maxval=3)
+    odometry = jnp.array([0.4, -0.1, 0.3])
+    moved = MODELS["pf_net"].move(poses, odometry, jnp.zeros((50, 3)))
+    np.testing.assert_array_equal(moved, compose(poses, odometry))
+
+
+def test_motion_noise_is_in_the_base_frame_and_never_below_its_floor(quick):
+    model, odometry = MODELS["pf_net"], jnp.array([0.4, -0.1, 0.3])
+    noise = jax.random.normal(jax.random.key(0), (20, 3))
+    pose = jnp.array([5.0, 2.0, 2.2])
+    moved = model.move(jnp.broadcast_to(pose, (20, 3)), odometry, noise)
+    np.testing.assert_allclose(relative(pose, moved), odometry + model.spread(odometry) * noise, atol=2e-6)
+    for increment in (jnp.zeros(3), odometry, 10 * odometry):
+        spread = np.asarray(model.spread(increment))
+        assert (spread >= np.array([0.02, 0.02, 0.01])).all() and np.isfinite(spread).all()
+
+
+def test_cell_is_a_gru_with_a_drawn_candidate():
+    cell, rng = MODELS["pfrnn"].cell, np.random.default_rng(0)
+    h, x, noise = (rng.normal(size=(5, n)) for n in (PFRNN.hidden, PFRNN.features + 3, PFRNN.hidden))
+    new, log_likelihood = cell(*(jnp.asarray(v, jnp.float32) for v in (h, x, noise)))
+    assert new.shape == (5, PFRNN.hidden) and log_likelihood.shape == (5,)
+
+    def dense(layer, v):
+        return v @ np.asarray(layer.kernel[...], np.float64) + np.asarray(layer.bias[...], np.float64)
+
+    both = np.concatenate([h, x], 1)
+    keep, reset = np.split(1 / (1 + np.exp(-dense(cell.gates, both))), 2, 1)
+    mean, spread = np.split(dense(cell.candidate, np.concatenate([reset * h, x], 1)), 2, 1)
+    candidate = np.tanh(mean + np.log1p(np.exp(spread - 1)) * noise)
+    expected = (1 - keep) * candidate + keep * h
+    np.testing.assert_allclose(new, expected, atol=1e-5)
+    likelihood = dense(cell.likelihood, np.concatenate([expected, x], 1))[:, 0]
+    np.testing.assert_allclose(log_likelihood, likelihood, atol=1e-5)
+
+
+def test_corrections_are_bounded_and_in_the_particles_frame(quick):
+    poses = jnp.array([[1.0, 2.0, 3.0], [0.0, 0.0, -1.0]])
+    wild = 1e3 * jax.random.normal(jax.random.key(0), (2, PFRNN.hidden))
+    step = np.abs(relative(poses, MODELS["pfrnn"].correct(poses, wild)))
+    assert (step <= np.array([0.5, 0.5, 0.3]) + 1e-5).all() and (step > 0.1).any()
+    np.testing.assert_array_equal(MODELS["pfrnn"].correct(poses, jnp.zeros((2, PFRNN.hidden)))[:, :2], poses[:, :2])
+
+
+def test_observation_network_by_hand():
+    net = MODELS["pf_net"].observation
+    views = np.random.default_rng(0).uniform(size=(3, VIEW.patches, 16))
+    gate, shift = np.random.default_rng(1).normal(size=(2, VIEW.patches, 8))
+
+    def leaky(v):
+        return np.where(v > 0, v, 0.1 * v)
+
+    def dense(layer, v):
+        return v @ np.asarray(layer.kernel[...]) + np.asarray(layer.bias[...])
+
+    x = leaky(views @ np.asarray(net.map_patch[...]) * gate + shift)
+    x = leaky(dense(net.compare, x)).reshape(3, VIEW.patches // 4, -1)
+    x = leaky(dense(net.whole, leaky(dense(net.join, x)).reshape(3, -1)))
+    np.testing.assert_allclose(net(jnp.asarray(views, jnp.float32), ScanCode(gate, shift)), x, atol=1e-4)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_start_anywhere_or_from_a_prior(quick, kind):
+    lost = jax.jit(lambda f, key: f.init(key))(make(kind, 500), jax.random.key(0))
+    assert is_free(tiny_world.grid(), lost.poses).all()
+    assert np.asarray(lost.poses[:, :2]).std(0).min() > 0.8
+    known = jax.jit(lambda f, key: f.init(key))(make(kind, 500, PRIOR), jax.random.key(0))
+    offset = np.asarray(relative(TRUTH, known.poses))
+    # 500 draws: the standard error of a mean is std / 22, of a standard deviation std / 32; five of them.
+    assert (np.abs(offset.mean(0)) < 5 / 22 * np.asarray(PRIOR.std)).all()
+    assert (np.abs(offset.std(0) / np.asarray(PRIOR.std) - 1) < 5 / 32).all()
+    given = make(kind, 2).start(jnp.stack([TRUTH, TRUTH]))
+    np.testing.assert_allclose(np.exp(given.log_weights), 0.5)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_update(quick, kind, episode):
+    chex.clear_trace_counter()
+    filter = make(kind, 24, PRIOR)
+    step = jax.jit(chex.assert_max_traces(lambda f, key, state, now: f.step(key, state, now, f.prepare(now)), n=1))
+    state = filter.init(jax.random.key(0))
+    for t in range(3):
+        state, info = step(filter, jax.random.key(t), state, inputs_at(episode, t))
+        assert isinstance(info, Info) and info.mean.shape == info.cluster.shape == (3,)
+        assert state.poses.shape == (24, 3) and np.isfinite(state.poses).all()
+        np.testing.assert_allclose(np.exp(state.log_weights).sum(), 1.0, atol=1e-5)
+        assert 0 <= float(info.lost) <= 1 and float(info.redrawn) == 0 and not bool(info.restarted)
+        assert (np.abs(wrap_angle(state.poses[:, 2]) - state.poses[:, 2]) < 1e-5).all()
+    if kind == "pfrnn":
+        assert state.hidden.shape == (24, PFRNN.hidden) and (np.abs(state.hidden) <= 1).all()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_run_of_100_is_the_run_alone_bit_for_bit(kind, episode):
+    keys = montecarlo.run_keys(0, 0, 100)
+    whole = montecarlo.run(make(kind), episode, keys)
+    for alone in (17, 99):
+        single = montecarlo.run(make(kind), episode, keys[alone : alone + 1])
+        jax.tree.map(
+            lambda a, b, r=alone: np.testing.assert_array_equal(a[r], b[0]), (whole.info, whole.state),
+            (single.info, single.state),
+        )  # fmt: skip
+
+
+def test_another_map_or_prior_needs_no_compilation(episode):
+    first = montecarlo.signature(make("pfrnn", 24, PRIOR), episode)
+    assert first == montecarlo.signature(make("pfrnn", 24, Prior(TRUTH + 1, PRIOR.std)), episode)
+
+
+def test_names():
+    assert set(LEARNED) == set(KINDS) <= set(METHODS) and not set(KINDS) & set(STANDARD)
+    assert [network_of(name) for name in ("mcl", "adam_hybrid", "pf_net", "pfrnn")] == [None, "dsom", "pf_net", "pfrnn"]
+    for kind in KINDS:
+        own = {"particles": 7, "t_cut": 0.6, "checkpoint": MODELS[kind]}
+        filter = build_filter(kind, tiny_world.grid(), tiny_world.LIDAR, **own)
+        assert filter.particles == 7 and filter.prior is None
+
+
+def test_beams_are_thinned_to_what_the_network_reads():
+    lidar = tiny_world.LIDAR.__class__(beams=360, range_max=5.0)
+    filter = LEARNED["pf_net"](MODELS["pf_net"], tiny_world.grid(), lidar, 5)
+    assert filter.beam_step == 12 and filter.lidar.beams == 30

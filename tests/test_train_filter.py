@@ -1,0 +1,272 @@
+"""Training of PF-Net and PFRNN: sequences, losses, a tiny problem, checkpoints, and the command line."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import yaml
+
+import dsom_jax
+import tiny_world
+from dsom_jax import checkpoint, train_filter
+from dsom_jax.errors import UserError, run_cli
+from dsom_jax.lidar import LidarConfig
+from dsom_jax.nn import create_pf_net
+from dsom_jax.occupancy import OccupancyGrid, is_free
+from dsom_jax.training import filter_evaluation
+from dsom_jax.training.filter_evaluation import summarise
+from dsom_jax.training.filter_loop import (
+    averaged_filter_model,
+    init_filter_state,
+    make_filter_step,
+    stack_maps,
+    start_poses,
+)
+from dsom_jax.training.filter_loss import huber, particle_loss, prediction_loss
+from dsom_jax.training.sequences import Window, make_windows, path_distance, plan_paths, spoil_world
+from learned_kit import DATA, KINDS, MODELS, PF_NET, quick_compilation, training
+
+quick = pytest.fixture(scope="module", autouse=True)(quick_compilation)
+GRID = replace(tiny_world.grid(), origin=jnp.zeros(3))
+
+
+@pytest.fixture(scope="module")
+def pool():
+    return plan_paths(0, [GRID, GRID], DATA)
+
+
+@pytest.fixture(scope="module")
+def windows(pool):
+    make = jax.jit(lambda key: make_windows(key, pool, DATA, GRID.resolution, 4, 12))
+    return make(jax.random.key(0))
+
+
+def test_paths_are_free_and_a_function_of_the_seed(pool):
+    again, other = plan_paths(0, [GRID, GRID], DATA), plan_paths(1, [GRID, GRID], DATA)
+    np.testing.assert_array_equal(pool.poses, again.poses)
+    assert not np.array_equal(pool.poses, other.poses)
+    assert pool.poses.shape == (8, 12, 3) and is_free(GRID, pool.poses).all()
+    assert pool.where.tolist() == [0] * 4 + [1] * 4
+
+
+def test_windows_are_pieces_of_paths(pool, windows):
+    assert windows.ranges.shape == (4, 4, 32) and windows.strays.shape == (4, 12, 3)
+    paths = np.asarray(pool.poses)
+    for poses, where in zip(np.asarray(windows.poses), np.asarray(windows.where), strict=True):
+        found = [n for n in range(8) for t in range(9) if np.array_equal(paths[n, t : t + 4], poses)]
+        assert found and all(pool.where[n] == where for n in found)
+    assert (windows.odometry[:, 0] == 0).all() and is_free(GRID, windows.strays).all()
+
+
+def test_odometry_tells_the_motion_with_some_noise(windows):
+    moved = jax.vmap(dsom_jax.relative)(windows.poses[:, :-1], windows.poses[:, 1:])
+    error = np.array(windows.odometry[:, 1:] - moved)
+    error[..., 2] = np.asarray(dsom_jax.wrap_angle(jnp.asarray(error[..., 2])))
+    # Of 0.2 m or 0.3 rad: standard deviations below 0.02 m and 0.04 rad; five of them.
+    assert (np.abs(error) < np.array([0.1, 0.1, 0.2])).all() and np.abs(error).max() > 0
+
+
+def test_the_world_differs_from_the_map_but_not_on_the_path(pool):
+    poses = pool.poses[0, :4]
+    spoil = jax.jit(lambda key: spoil_world(key, GRID, poses, DATA))
+    worlds = [spoil(jax.random.key(n)) for n in range(6)]
+    assert any((world.occupied & ~GRID.occupied).any() for world in worlds)
+    assert any((GRID.occupied & ~world.occupied).any() for world in worlds)
+    far = np.asarray(path_distance(GRID, poses)) > 1.0 + 2.5  # removed pieces are at most 2.5 m wide
+    for world in worlds:
+        i, j = (np.floor(np.asarray(poses)[:, axis] / GRID.resolution).astype(int) for axis in (1, 0))
+        assert not np.asarray(world.occupied)[i, j].any()
+        assert (np.asarray(world.occupied) == np.asarray(GRID.occupied))[far].all()
+
+
+def test_distance_to_a_path_by_hand():
+    grid = OccupancyGrid(jnp.zeros((2, 3), bool), jnp.ones((2, 3), bool), jnp.zeros(3), 1.0)
+    distance = path_distance(grid, jnp.array([[0.5, 0.5, 0.0], [2.5, 0.5, 1.0]]))
+    np.testing.assert_allclose(distance, [[0, 1, 0], [1, np.sqrt(2), 1]], atol=1e-6)
+
+
+def test_prediction_loss_by_hand():
+    poses = jnp.array([[0.0, 0.0, 0.0], [0.4, 0.0, 0.2]])
+    even = jnp.log(jnp.array([0.5, 0.5]))
+    loss = prediction_loss(poses, even, jnp.zeros(3), 2.0)
+    np.testing.assert_allclose(loss, 0.2**2 + 2 * 2 * (1 - (1 + np.cos(0.2)) / 2), rtol=1e-4)
+    assert float(prediction_loss(poses, even, jnp.array([0.2, 0.0, 2 * np.pi]), 0.0)) < 1e-6
+    np.testing.assert_allclose(huber(jnp.array([0.25, 1.0, 9.0])), [0.25, 1.0, 5.0])
+
+
+def test_particle_loss_by_hand():
+    poses = jnp.array([[0.0, 0.0, 0.0], [1.0, 0.0, -np.pi]])
+    loss = particle_loss(poses, jnp.array([0.0, 0.0, 2 * np.pi]), 0.5, 0.2)
+    far = np.exp(-0.5 * (1 / 0.25 + np.pi**2 / 0.04))
+    np.testing.assert_allclose(loss, -np.log(0.5 * (1 + far)), rtol=1e-5)
+
+
+def test_particles_start_about_the_truth(windows):
+    window = jax.tree.map(lambda leaf: leaf[0], windows)
+    config = training("pf_net", strays=0.0, start_xy=(0.1, 0.1), start_theta=(0.05, 0.05), particles=12)
+    offset = dsom_jax.relative(window.poses[0], start_poses(jax.random.key(0), window, config))
+    assert np.abs(offset).max() < 0.7
+    half = training("pf_net", strays=0.99)
+    draw = jax.jit(lambda key: start_poses(key, window, half))
+    starts = jnp.stack([draw(jax.random.key(n)) for n in range(20)])
+    share = (starts == window.strays).all(-1).mean(1)
+    assert 0.3 < float((share == 0).mean()) < 0.8 and float(share.max()) > 0.4
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_training_lowers_the_loss(kind, pool, windows):
+    config = training(kind, learning_rate=3e-3)
+    step, state = make_filter_step(config, stack_maps(pool, GRID.resolution)), init_filter_state(config)
+    first = [np.array(leaf) for leaf in jax.tree.leaves(state.params)]
+    losses = []
+    for _ in range(60):
+        state, metrics = step(state, windows, jnp.int32(1000))
+        losses.append(float(metrics["total"]))
+    assert np.mean(losses[-10:]) < 0.8 * np.mean(losses[:10])
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(state))
+    changed = [not np.array_equal(a, b) for a, b in zip(first, jax.tree.leaves(state.params), strict=True)]
+    assert all(changed), "a weight without gradient"
+    assert averaged_filter_model(config, state).config == config.model
+
+
+def test_summary_of_tracking():
+    error = np.zeros((4, 3, 2))
+    error[:, -1, 0] = [0.1, 0.2, 0.3, 0.9]
+    assert summarise(jnp.asarray(error)) | {"e_pos_m": 0} == {
+        "sequences": 4, "updates": 3, "tracked": 0.75, "e_pos_m": 0, "e_theta_rad": 0.0,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_checkpoint_round_trip(kind, tmp_path):
+    checkpoint.save(tmp_path / "c", MODELS[kind])
+    loaded = checkpoint.load(tmp_path / "c", tiny_world.LIDAR, GRID.resolution, kind=kind)
+    assert loaded.config == MODELS[kind].config
+    jax.tree.map(np.testing.assert_array_equal, jax.tree.leaves(loaded), jax.tree.leaves(MODELS[kind]))
+    other = "dsom" if kind == "pf_net" else "pf_net"
+    with pytest.raises(UserError, match=f"field kind is {kind}, but a {other} is needed"):
+        checkpoint.load(tmp_path / "c", kind=other)
+    with pytest.raises(UserError, match="does not fit the lidar: range_max 4 m"):
+        checkpoint.load(tmp_path / "c", LidarConfig(range_max=4.0), kind=kind)
+    with pytest.raises(UserError, match=r"works at 0\.25 m per cell"):
+        checkpoint.load(tmp_path / "c", resolution=0.05, kind=kind)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_shipped_checkpoints_fit_the_suite(kind):
+    folder = checkpoint.shipped(kind)
+    assert folder is not None
+    assert checkpoint.load(folder, dsom_jax.load_suite("synthetic-v1").lidar, 1 / 3, kind)
+    record = checkpoint.load_provenance(folder, kind)
+    assert record["steps"] == record["total"] and record["metrics"]["tracked"] >= 0.9
+    text = (folder / record["weights"] / "commit_success.txt").read_text()
+    assert text == f"Checkpoint commit was successful to {record['weights']}"
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("train_filter")
+    dsom_jax.save_ros_map(tiny_world.grid(), folder / "map.yaml")
+    config = {
+        "model": {"view": {"cells": 8, "map_resolution": 0.25, "beams": 32, "reach_min": 5.0}, "width": 4,
+                  "features": 4, "hidden": 4},
+        "data": {"lidar": {"beams": 32, "angle_increment": 2 * np.pi / 32, "range_max": 5.0}, "beam_step": 1,
+                 "drives": 2, "length": 6, "window": 3, "obstacles": 0, "removed": 0,
+                 "drive": {"update_min_d": 0.2}},
+        "batch": 2, "particles": 6,
+    }  # fmt: skip
+    (folder / "tiny.yaml").write_text(yaml.safe_dump(config))
+    return folder
+
+
+def command(files: Path, monkeypatch, out: str, *words: str) -> None:
+    given = ("--filter", "pfrnn", "--config", str(files / "tiny.yaml"), "--maps", str(files / "map.yaml"))
+    rest = ("--steps", "4", "--save-steps", "2", "--out", str(files / out), *words)
+    monkeypatch.setattr(sys, "argv", ["train_filter", *given, *rest])
+    run_cli(train_filter.main)
+
+
+def weights(folder: Path) -> bytes:
+    return b"".join(np.asarray(x).tobytes() for x in jax.tree.leaves(checkpoint.load(folder, kind="pfrnn")))
+
+
+def test_a_run_that_lost_its_end_resumes_bit_for_bit(files, monkeypatch):
+    made, parts = [], train_filter.parts
+
+    def compiled_once(run):
+        made.append(made[0] if made else parts(run))
+        return made[0]._replace(state=train_filter.first_state(run))
+
+    def blank_windows(key, pool, config, resolution, count, strays):
+        """Robots that stand at the start of their paths and see nothing: no scans to compile."""
+        poses = jnp.broadcast_to(pool.poses[:count, :1], (count, config.window, 3))
+        blank = jnp.full((count, config.window, config.lidar.beams), jnp.inf)
+        return Window(pool.where[:count], blank, jnp.zeros_like(poses), poses, jnp.zeros((count, strays, 3)))
+
+    monkeypatch.setattr(train_filter, "parts", compiled_once)
+    monkeypatch.setattr(filter_evaluation, "make_windows", blank_windows)
+    command(files, monkeypatch, "run")
+    whole, log = weights(files / "run"), (files / "run" / "metrics.jsonl").read_text()
+    record = json.loads((files / "run" / "provenance.json").read_text())
+    assert (record["kind"], record["steps"], record["data"]) == ("pfrnn", 4, ["map.yaml"])
+    assert record["samples"] == 4 * 2 * 3
+    assert record["metrics"]["sequences"] == 32 and record["metrics"]["updates"] == 6
+    # As if it had been killed after the third step: the last state is of the second.
+    shutil.rmtree(files / "run" / "state-00000004")
+    command(files, monkeypatch, "run", "--resume")
+    assert weights(files / "run") == whole
+    numbers = [{k: v for k, v in json.loads(line).items() if k != "seconds"} for line in log.splitlines()]
+    again = (files / "run" / "metrics.jsonl").read_text().splitlines()
+    assert [{k: v for k, v in json.loads(line).items() if k != "seconds"} for line in again] == numbers
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--steps", "0"), "--steps 0"),
+        (("--filter", "magic"), "filter"),
+        (("--maps", "nowhere.yaml"), "nowhere.yaml"),
+        (("--config", "nowhere.yaml"), "nowhere.yaml"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(files, monkeypatch, capsys, words, message):
+    with pytest.raises(SystemExit) as stop:
+        command(files, monkeypatch, "never", *words)
+    error = capsys.readouterr().err
+    assert stop.value.code == 2 and error.count("\n") == 1 and message in error
+    assert not (files / "never").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [("colour: 1", "unknown field colour"), ("data: {window: 1}", "window = 1"), ("strays: 2.0", "strays"),
+     ("model: {hidden: 3}", "unknown field hidden"), ("batch: 0", "batch"), ("start_xy: [2.0, 1.0]", "start_xy")],
+)  # fmt: skip
+def test_bad_configurations(tmp_path, text, message):
+    with pytest.raises(UserError, match=message):
+        train_filter.Arguments("pf_net").read_config(yaml.safe_load(text), "c.yaml")
+
+
+def test_a_run_of_another_filter_is_not_resumed(tmp_path):
+    create = train_filter.FilterRun(tmp_path, training("pfrnn"), (), 3)
+    train_filter.create(create)
+    with pytest.raises(UserError, match="unknown field"):
+        train_filter.open_run(train_filter.Arguments("pf_net", out=tmp_path, resume=True))
+    with pytest.raises(UserError, match="not empty"):
+        train_filter.open_run(train_filter.Arguments("pfrnn", out=tmp_path))
+    with pytest.raises(UserError, match="--steps 5"):
+        train_filter.open_run(train_filter.Arguments("pfrnn", out=tmp_path, resume=True, steps=5))
+
+
+def test_fresh_networks_depend_on_the_seed_alone():
+    first, again, other = (jax.tree.leaves(create_pf_net(PF_NET, seed)) for seed in (1, 1, 2))
+    assert all(np.array_equal(a, b) for a, b in zip(first, again, strict=True))
+    assert not np.array_equal(first[0], other[0]) or not np.array_equal(first[-1], other[-1])
