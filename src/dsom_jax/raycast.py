@@ -13,6 +13,7 @@ from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.custom_batching import custom_vmap
 
 from dsom_jax import checks
 from dsom_jax.geometry import compose
@@ -156,6 +157,7 @@ def _directions(theta: Array, bearings: Array) -> tuple[Array, Array]:
     return _turned(c, s, jnp.cos(bearings), jnp.sin(bearings))
 
 
+@custom_vmap
 def march(squares: Array, x: Array, y: Array, theta: Array, bearings: Array, limit: float) -> Array:
     """Distance in cells to the first occupied cell; inf from ``limit`` on, and for rays that leave the map.
 
@@ -171,6 +173,22 @@ def march(squares: Array, x: Array, y: Array, theta: Array, bearings: Array, lim
     Every step leaps out of the largest empty square ahead. All rays take a few steps together; the few that are still
     under way (grazing a wall) are then taken up one per group of 32, so that they do not hold up the rest.
     """
+    return _march(squares, x, y, theta, bearings, limit)
+
+
+@march.def_vmap
+def _march_batch(
+    axis_size: int, batched: list[bool], squares: Array, x: Array, y: Array, theta: Array, bearings: Array, limit: Array
+) -> tuple[Array, bool]:
+    """Under ``vmap`` over poses: more poses, as a batch of loops would gather and scatter far more slowly."""
+    if batched[0] or batched[4] or batched[5]:
+        return jax.vmap(_march, [0 if b else None for b in batched])(squares, x, y, theta, bearings, limit), True
+    poses = zip((x, y, theta), batched[1:4], strict=True)
+    x, y, theta = (v if b else jnp.broadcast_to(v, (axis_size, *v.shape)) for v, b in poses)
+    return march(squares, x, y, theta, bearings, limit), True
+
+
+def _march(squares: Array, x: Array, y: Array, theta: Array, bearings: Array, limit: float | Array) -> Array:
     shape = (*x.shape, bearings.size)
     x, y, theta = (v.ravel()[:, None] for v in (x, y, theta))
     known = inside((squares.shape[1] - 2, squares.shape[2] - 2), y, x) & jnp.isfinite(theta)
@@ -183,7 +201,7 @@ def march(squares: Array, x: Array, y: Array, theta: Array, bearings: Array, lim
     return jnp.where(hit, reach, jnp.inf).reshape(shape)
 
 
-def _march_fan(squares: Array, fan: _Fan, limit: float) -> Array:
+def _march_fan(squares: Array, fan: _Fan, limit: float | Array) -> Array:
     shape = (fan.x.size, fan.beam_cos.size)
     count = math.prod(shape)
     groups = -(-count // _GROUP)
