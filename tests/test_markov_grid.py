@@ -13,10 +13,11 @@ import pytest
 import tiny_world
 from dsom_jax.filters.adam_memory import AdamMemory
 from dsom_jax.filters.adam_robust import AdamRobust, RobustConfig
-from dsom_jax.geometry import wrap_angle
+from dsom_jax.geometry import compose, inverse, wrap_angle
 from dsom_jax.montecarlo import run, run_keys
 from dsom_jax.motion import OdometryMotion
 from dsom_jax.occupancy import from_cells
+from dsom_jax.pose_grid import cell_pose, pose_cell
 from dsom_jax.proposals.likelihood_grid import LikelihoodGridConfig, likelihood_grid
 from dsom_jax.proposals.markov_grid import MarkovGrid, MarkovGridConfig
 from dsom_jax.proposals.uniform import free_space
@@ -75,6 +76,36 @@ def test_a_certain_robot_in_the_open_drives_where_its_odometry_says(memory):
     rows = moved.sum((1, 2))
     assert np.average((np.arange(len(rows)) - i) ** 2, weights=rows) == pytest.approx(0.25, abs=1e-4)
     assert moved.sum() == pytest.approx(1.0, abs=1e-5)
+
+
+@pytest.mark.parametrize("mount", [(0.0, 0.0, 0.0), (0.4, -0.2, 1.0)])
+def test_a_turning_robot_goes_where_compose_says(mount):
+    grid = from_cells(np.zeros((16, 16), bool), resolution=0.5, origin=(3.0, -1.0, 0.4))
+    likelihood = likelihood_grid(grid, replace(LIDAR, mount=mount), SMALL)
+    still = MarkovGrid(likelihood, MarkovGridConfig(slip=0.0))
+    belief = np.zeros(still.begin().shape, np.float32)
+    belief[8 * 16 + 7, 5] = 1.0
+    odometry, sensor = jnp.array([0.8, -0.3, 0.9]), jnp.array([*mount[:2], 0.0])
+    start = cell_pose(likelihood.pose_grid, jnp.array(8.0), jnp.array(7.0), jnp.array(5.0))
+    base = compose(compose(start, inverse(sensor)), odometry)
+    expected = pose_cell(likelihood.pose_grid, compose(base, sensor))
+    moved = dense(still, still.predict(jnp.asarray(belief), odometry))
+    i, j, k = (np.average(np.arange(n), weights=moved.sum(axes)) for n, axes in
+               zip(moved.shape, [(1, 2), (0, 2), (0, 1)], strict=True))  # fmt: skip
+    np.testing.assert_allclose([i, j, k], expected, atol=1e-4)
+
+
+@pytest.mark.parametrize("odometry", [(1.0, 0.0, 0.0), (-0.8, 0.6, 0.7)])
+def test_no_belief_comes_in_where_a_map_ends_in_free_space(odometry):
+    open_space = np.zeros((7, 9), bool)
+    grid = from_cells(open_space, resolution=0.5)
+    memory = MarkovGrid(likelihood_grid(grid, LIDAR, SMALL), MarkovGridConfig(slip=0.2))
+    belief, expected = memory.begin(), dense(memory, memory.begin())
+    for _ in range(2):
+        belief = memory.predict(belief, jnp.asarray(odometry, jnp.float32))
+        expected = markov.predict(expected, ~open_space, odometry, 0.5, slip=0.2)
+    np.testing.assert_allclose(dense(memory, belief), expected, rtol=2e-5, atol=1e-6 * expected.max())
+    assert float(belief.sum()) == pytest.approx(expected.sum(), rel=1e-5)
 
 
 def test_an_update_is_bayes_rule(room):

@@ -23,7 +23,7 @@ def predict(belief, free, odometry, resolution, slip):
     new = np.zeros_like(belief)
     moves = [(1 - slip, 1.0), (slip / 2, -1.0)]
     for i, j, k in itertools.product(*map(range, belief.shape)):
-        theta = -math.pi + k * turn + odometry[2] / 2
+        theta = -math.pi + k * turn
         x = math.cos(theta) * odometry[0] - math.sin(theta) * odometry[1]
         y = math.sin(theta) * odometry[0] + math.cos(theta) * odometry[1]
         landed = np.zeros((height, width))

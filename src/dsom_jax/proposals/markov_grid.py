@@ -15,6 +15,7 @@ import jax.numpy as jnp
 
 from dsom_jax import checks
 from dsom_jax import pose_grid as pg
+from dsom_jax.geometry import rotate
 from dsom_jax.proposals.likelihood_grid import LikelihoodGrid
 from dsom_jax.types import Array, Inputs, Key
 
@@ -60,9 +61,12 @@ class MarkovGrid:
 
     def begin(self) -> Array:
         """Belief before the first update: even over free space."""
-        real = self.likelihood.cells < self.likelihood.free.size
-        even = jnp.broadcast_to(real[:, None], (real.size, self.likelihood.config.headings))
+        even = jnp.broadcast_to(self._real(), (self.likelihood.cells.size, self.likelihood.config.headings))
         return even / jnp.maximum(even.sum(), 1)
+
+    def _real(self) -> Array:
+        """Which of the cells (C, 1) are cells, not filling."""
+        return (self.likelihood.cells < self.likelihood.free.size)[:, None]
 
     def recall(self, belief: Array, inputs: Inputs) -> tuple[Recollection, Array]:
         """Belief (C, K) of the update before -> PMs of this one, and its belief."""
@@ -89,14 +93,16 @@ class MarkovGrid:
     def predict(self, belief: Array, odometry: Array) -> Array:
         """Belief (C, K) moved by a body-frame increment (3,); what would leave free space is lost."""
         grid, cells = self.likelihood.pose_grid, self.likelihood.cells
-        theta = pg.heading(grid, jnp.arange(grid.headings)) + odometry[2] / 2
-        across = jnp.cos(theta) * odometry[0] - jnp.sin(theta) * odometry[1]
-        along = jnp.sin(theta) * odometry[0] + jnp.cos(theta) * odometry[1]
-        shift = jnp.stack([along, across]) / grid.resolution
+        x, y, _ = self.likelihood.lidar.mount
+        # Cells are those of the sensor, which a turn of the base moves, too.
+        swing = jnp.stack(rotate(odometry[2], x, y)) - jnp.array([x, y])
+        theta = pg.heading(grid, jnp.arange(grid.headings))
+        steps = (swing + odometry[:2], swing - odometry[:2])
+        shifts = (jnp.stack(rotate(theta, *step)[::-1]) / grid.resolution for step in steps)
         full = jnp.zeros((self.likelihood.free.size + 1, grid.headings)).at[cells].set(belief)
-        forth, back = (shifted(full, cells, (grid.height, grid.width), s) for s in (shift, -shift))
+        forth, back = (shifted(full, cells, (grid.height, grid.width), s) for s in shifts)
         moved = (1 - self.config.slip) * forth + self.config.slip / 2 * (back + belief)
-        return turned(moved, odometry[2] / grid.turn)
+        return jnp.where(self._real(), turned(moved, odometry[2] / grid.turn), 0.0)
 
 
 def normalised(belief: Array) -> Array:
