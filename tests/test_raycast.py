@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from dsom_jax import raycast
+from dsom_jax.errors import UserError
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.occupancy import from_cells
 from dsom_jax.raycast import RaycastConfig, empty_squares, make_tables
@@ -234,3 +235,29 @@ def test_nothing_is_retraced():
 def test_bad_configuration_is_refused(fields, said):
     with pytest.raises(ValueError, match=said):
         RaycastConfig(**fields)
+
+
+@pytest.mark.parametrize("bearing", [-5e-17, 5e-17, -5e-10])
+@pytest.mark.parametrize("heading", [0.0, -math.pi])
+def test_bearings_that_rounding_leaves_a_little_off_the_axis(bearing, heading):
+    """-0.3 + 3 * 0.1 is not zero in float64; the direction of such a ray is no multiple of float32's usual step."""
+    tables = make_tables(from_cells(ROOM, resolution=1.0), EXACT, 10.0)
+    lidar = LidarConfig(beams=1, angle_min=bearing, range_max=10.0)
+    (reach,) = cast_rays(tables, jnp.array([2.5, 1.5, heading]), lidar)
+    assert float(reach) == pytest.approx(3.5 if heading == 0.0 else 1.5, abs=CELLS)
+
+
+def test_a_wall_of_one_cell_on_a_map_of_more_cells_than_float32_counts():
+    squares = np.ones((4, 4200, 4200), np.uint8)  # of one cell each, so that nothing has to be searched for
+    squares[:, 4190, 4001] = 0
+    x, y = jnp.array([3990.25, 4010.25]), jnp.array([4189.5, 4189.5])
+    reach = raycast.march(jnp.asarray(squares), x, y, jnp.array([0.0, math.pi]), jnp.zeros(1), 30.0)
+    # The squares have a border of one cell: the wall lies from 4000 to 4001.
+    np.testing.assert_allclose(reach[:, 0], [9.75, 9.25], atol=CELLS)
+
+
+@pytest.mark.parametrize("shape", [(2000, 3000), (1, 2**14)])
+def test_maps_too_large_for_a_table_are_refused(shape):
+    grid = from_cells(np.zeros(shape, bool), resolution=0.05)
+    with pytest.raises(UserError, match="too large for a table"):
+        make_tables(grid, RaycastConfig("table"), 10.0)

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 
 from dsom_jax import checks
+from dsom_jax.errors import UserError
 from dsom_jax.geometry import compose
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.occupancy import OccupancyGrid, inside
@@ -75,7 +76,14 @@ class MapTables:
 
 @partial(jax.jit, static_argnames=("config", "range_max"))
 def make_tables(grid: OccupancyGrid, config: RaycastConfig, range_max: float) -> MapTables:
-    """Tables for :func:`cast_rays` up to ``range_max`` metres."""
+    """Tables for :func:`cast_rays` up to ``range_max`` metres.
+
+    Raises:
+        UserError: the map is too large for ``table``, whose entries are counted in int32 and name walls in int16.
+    """
+    if config.method == "table" and (grid.occupied.size * config.angles >= 2**31 or max(grid.shape) >= 2**14):
+        cells, angles = "x".join(map(str, grid.shape)), config.angles
+        raise UserError(f"map of {cells} cells is too large for a table of {angles} angles; use method exact")
     squares = empty_squares(jnp.pad(grid.occupied, 1, constant_values=True), config.max_skip)
     tables = MapTables(grid, squares, None, range_max, config.surface * grid.resolution)
     if config.method == "exact":
@@ -224,6 +232,13 @@ def _march_fan(squares: Array, fan: _Fan, limit: float | Array) -> Array:
     return reach[:count].reshape(shape)
 
 
+def _flat_index(i: Array, j: Array, shape: tuple[int, int]) -> Array:
+    """int32 index of cells (i, j), whole numbers in float32, of an array of ``shape``."""
+    if shape[0] * shape[1] <= 2**24:  # float32 is exact up to there, and one conversion cheaper
+        return (i * shape[1] + j).astype(jnp.int32)
+    return i.astype(jnp.int32) * shape[1] + j.astype(jnp.int32)
+
+
 def _at(values: Array, index: Array) -> Array:
     return values.at[index].get(mode="promise_in_bounds")
 
@@ -239,13 +254,13 @@ def _leap(squares: Array, rays: tuple[Array, Array, Array, Array], reach: Array,
     flat = squares.reshape(-1)
     right, up = dx >= 0, dy >= 0
     layer = jnp.where(up, 2 * height * width, 0) + jnp.where(right, height * width, 0)
-    per_x, per_y = (1 / jnp.where(jnp.abs(v) < 1e-9, 1e-9, v) for v in (dx, dy))
+    per_x, per_y = (1 / jnp.where(v >= 0, jnp.maximum(v, 1e-9), jnp.minimum(v, -1e-9)) for v in (dx, dy))
     sign_x, sign_y = jnp.where(right, 1.0, -1.0), jnp.where(up, 1.0, -1.0)
     edge_x, edge_y = jnp.where(right, 0.0, 1.0) - x, jnp.where(up, 0.0, 1.0) - y
     ahead_x, ahead_y = x + _NUDGE * sign_x, y + _NUDGE * sign_y
     for _ in range(steps):
         j, i = jnp.floor(ahead_x + reach * dx), jnp.floor(ahead_y + reach * dy)
-        side = _at(flat, layer + (i * width + j).astype(jnp.int32)).astype(jnp.float32)
+        side = _at(flat, layer + _flat_index(i, j, (height, width))).astype(jnp.float32)
         leave = jnp.minimum((j + edge_x + side * sign_x) * per_x, (i + edge_y + side * sign_y) * per_y)
         # Without the barrier XLA computes each leap again for every later one.
         reach, side = jax.lax.optimization_barrier((jnp.maximum(reach, leave), side))
@@ -288,7 +303,8 @@ def _meet_walls(walls: Array, x: Array, y: Array, theta: Array, bearings: Array)
     height, width, angles = walls.shape
     dx, dy = _directions(theta, bearings)
     known = inside((height, width), y, x) & jnp.isfinite(theta)[..., None]
-    cell = jnp.where(known, jnp.floor(y) * width + jnp.floor(x), 0).astype(jnp.int32) * angles
+    i, j = (jnp.where(known, jnp.floor(v), 0.0) for v in (y, x))
+    cell = _flat_index(i, j, (height, width)) * angles
     turns = (theta[..., None] + bearings) * (angles / (2 * jnp.pi))
     bins = jnp.round(jnp.where(known, turns, 0.0)).astype(jnp.int32) % angles
     wall = _at(walls.reshape(-1), cell + bins).astype(jnp.int32)
