@@ -93,9 +93,9 @@ class MarkovGrid:
     def predict(self, belief: Array, odometry: Array) -> Array:
         """Belief (C, K) moved by a body-frame increment (3,); what would leave free space is lost."""
         grid, cells = self.likelihood.pose_grid, self.likelihood.cells
-        x, y, _ = self.likelihood.lidar.mount
+        mount = jnp.array(self.likelihood.lidar.mount)[:2]
         # Cells are those of the sensor, which a turn of the base moves, too.
-        swing = jnp.stack(rotate(odometry[2], x, y)) - jnp.array([x, y])
+        swing = jnp.stack(rotate(odometry[2], *mount)) - mount
         theta = pg.heading(grid, jnp.arange(grid.headings))
         steps = (swing + odometry[:2], swing - odometry[:2])
         shifts = (jnp.stack(rotate(theta, *step)[::-1]) / grid.resolution for step in steps)
