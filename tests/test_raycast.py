@@ -229,7 +229,8 @@ def test_nothing_is_retraced():
 
 @pytest.mark.parametrize(
     ("fields", "said"),
-    [(dict(method="fast"), "'exact' or 'table'"), (dict(angles=2), "angles >= 4"), (dict(max_skip=0), "max_skip"),
+    [(dict(method="fast"), "'exact' or 'table'"), (dict(angles=2), "angles = 2: give at least 4"),
+     (dict(max_skip=0), "max_skip"),
      (dict(max_skip=300), "max_skip")],
 )  # fmt: skip
 def test_bad_configuration_is_refused(fields, said):

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 
 from dsom_jax.filters.adam_robust import AdamRobust, RobustState
+from dsom_jax.occupancy import is_free
 from dsom_jax.proposals.markov_grid import MarkovGrid, Recollection
 from dsom_jax.types import Array, Inputs
 
@@ -49,4 +50,6 @@ class AdamMemory(AdamRobust):
     def _log_redrawn(self, state: RobustState, poses: Array, prepared: Recollection) -> Array:
         """log(a b-(x)); at the first update all is redrawn."""
         share = jnp.where(state.updates == 0, 0.0, jnp.log(self.share))
-        return share + self.proposal.log_prior(prepared, poses)
+        # The grid knows where the sensor may be; beside it the base may stand in a wall.
+        stands = is_free(self.tables.grid, poses)
+        return share + jnp.where(stands, self.proposal.log_prior(prepared, poses), -jnp.inf)
