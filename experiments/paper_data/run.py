@@ -29,7 +29,7 @@ from dsom_jax.data.log import limited
 from dsom_jax.data.suite import Suite
 from dsom_jax.episode import Episode
 from dsom_jax.errors import UserError, run_cli
-from dsom_jax.filters.methods import COMBINATIONS, DRAWN, REAL, make_filter, make_proposal, needs_checkpoint
+from dsom_jax.filters.methods import COMBINATIONS, DRAWN, REAL, make_filter, make_proposal, network_of
 from dsom_jax.montecarlo import run_keys
 from dsom_jax.occupancy import OccupancyGrid, is_free
 from dsom_jax.proposals.dual_features import with_episode
@@ -147,8 +147,12 @@ def read_logs(plan: Plan, data: Path) -> Iterator[RawLog]:
         raise UserError(f"{data}: holds nothing like {', '.join(plan.logs)}; see README.md for the layout")
     for path in paths:
         beside = path.with_suffix(".tum")
-        topics = {"scan_topic": plan.scan_topic or None, "odom_topic": plan.odom_topic or None}
-        log = load_log(path, reference=beside if beside.is_file() else None, **topics)
+        log = load_log(
+            path,
+            reference=beside if beside.is_file() else None,
+            scan_topic=plan.scan_topic or None,
+            odom_topic=plan.odom_topic or None,
+        )
         for line in log.report.lines():
             print(f"{path.name}: {line}")
         yield limited(log, plan.laser_max_range)
@@ -186,7 +190,7 @@ def choose(plan: Plan, logs: list[RawLog], name: str, grid: OccupancyGrid) -> Su
 
 def network_for(plan: Plan, map_yaml: Path, start: Path | None, folder: Path) -> Path | None:
     """Folder of the network for this map: adapted to it, or as it is; None if no method draws from one."""
-    if not any(map(needs_checkpoint, plan.methods)):
+    if not any(network_of(name) == "dsom" for name in plan.methods):
         return None
     if start is None:
         raise UserError("--checkpoint: no network is shipped; name the folder of one")

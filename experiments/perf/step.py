@@ -8,6 +8,7 @@ so they need not add up: inside of the step XLA fuses some of them. Goal for Ada
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -66,7 +67,7 @@ def method_times(filter: Any, episode: Episode, runs: int, repeats: int, warm: i
     split = robust_parts if hasattr(filter, "tables") else score_parts
     for name, (function, arguments) in split(filter, keys, states, now, prepared).items():
         part = compiled(jax.vmap(function))
-        times[name] = measure(lambda part=part, arguments=arguments: part(*arguments), repeats)
+        times[name] = measure(partial(part, *arguments), repeats)
     whole = measure(lambda: montecarlo.run(filter, first, keys), 3)
     return times | {"whole_run_per_update": {k: v / warm for k, v in whole.items()}}
 
@@ -94,7 +95,7 @@ def score_parts(filter: Any, keys: Any, states: Any, now: Inputs, prepared: Any)
         "rays": (lambda s: cast_rays(world.tables, s.poses, world.lidar), (states,)),
         "score": (lambda e: beam_score(seen, e, world.score), (expected,)),
         "rays_and_score": (lambda s: world.weigh(s.poses, now.ranges), (states,)),
-        "estimates": (lambda s: describe(s.poses, s.normalised, 0.0, False), (states,)),
+        "estimates": (lambda s: describe(s.poses, s.normalised, jnp.float32(0.0), jnp.bool_(False)), (states,)),
     }  # fmt: skip
     if prepared is not None:
         fresh, _ = compiled(jax.vmap(lambda k: filter.proposal.sample(k, prepared, config.particles)))(keys)
@@ -119,7 +120,10 @@ def robust_parts(filter: Any, keys: Any, states: Any, now: Inputs, prepared: Any
         "draw_once": (lambda k: filter.proposal.sample(k, prepared, count), (keys,)),
         "rays": (lambda s: cast_rays(filter.tables, s.poses, filter.lidar), (states,)),
         "likelihood": (lambda e: beam_log_likelihood(seen, e, filter.config.model), (expected,)),
-        "estimates": (lambda s: describe(s.poses, jnp.exp(s.log_weights), 0.0, False), (states,)),
+        "estimates": (
+            lambda s: describe(s.poses, jnp.exp(s.log_weights), jnp.float32(0.0), jnp.bool_(False)),
+            (states,),
+        ),
     }
 
 

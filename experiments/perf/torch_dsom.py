@@ -89,7 +89,7 @@ class TorchDSOM(nn.Module):
         return self.head(x) + F.interpolate(fine, scale_factor=2), fine, coarse
 
 
-def make_step(config: DSOMConfig, occupied, views, scans, targets, free):  # type: ignore[no-untyped-def]
+def make_step(config: DSOMConfig, occupied, views, scans, targets, free):
     """A function that makes one step of Adam on the batch: NumPy arrays, targets at the three resolutions."""
     model = TorchDSOM(config, scans.shape[2])
     adam = torch.optim.Adam(model.parameters(), 1e-3)
@@ -111,7 +111,7 @@ def make_step(config: DSOMConfig, occupied, views, scans, targets, free):  # typ
     return step
 
 
-def make_inference(config: DSOMConfig, occupied, views, scan):  # type: ignore[no-untyped-def]
+def make_inference(config: DSOMConfig, occupied, views, scan):
     """A function that decodes one scan with the map's features cached, in evaluation mode: a module in parts."""
     model = TorchDSOM(config, scan.shape[1]).eval()
     cached: dict[str, torch.Tensor] = {}

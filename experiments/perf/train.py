@@ -32,7 +32,7 @@ Call = Callable[[], Any]
 
 def training(config: TrainConfig, batch: Batch) -> tuple[Call, float]:
     """One step on ``batch``, and its GFLOP."""
-    step = make_step(config)
+    step: Any = make_step(config)
     compiled = step.lower(init_state(config), batch, jnp.int32(1000)).compile()
     state = init_state(config)
 

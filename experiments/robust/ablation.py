@@ -12,7 +12,7 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jax
 import tyro
@@ -20,6 +20,7 @@ import tyro
 from dsom_jax import localize
 from dsom_jax.data import load_log, load_ros_map
 from dsom_jax.filters.methods import REAL, Settings, make_filter, make_proposal
+from dsom_jax.motion import OdometryMotion
 
 HERE = Path(__file__).parent
 
@@ -46,7 +47,7 @@ def markov(**changes: Any) -> Callable[[Settings], Settings]:
 
 def slip(value: float) -> Callable[[Settings], Settings]:
     """Settings with other slip of the wheels."""
-    return lambda s: replace(s, robust_motion=replace(s.robust_motion, slip=value))
+    return lambda s: replace(s, robust_motion=replace(cast(OdometryMotion, s.robust_motion), slip=value))
 
 
 def surface(value: float) -> Callable[[Settings], Settings]:
