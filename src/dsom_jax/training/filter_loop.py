@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import jax
@@ -130,7 +130,7 @@ def start_poses(key: Key, window: Window, config: FilterTrainConfig) -> Array:
 def follow(params: Any, graph: Any, config: FilterTrainConfig, places: CornerMap, key: Key, window: Window) -> Any:
     """States of the filter after each update of a sequence, leaves (L, ...)."""
     k_start, k_steps = jax.random.split(key)
-    filter: Any = make_tracker(params, graph, config, CornerMap(places.codes[window.where], *_frame(places)))
+    filter: Any = make_tracker(params, graph, config, replace(places, codes=places.codes[window.where]))
 
     def update(state: Any, now: tuple[Key, Array, Array]) -> tuple[Any, Any]:
         inputs = Inputs(now[1], now[2], jnp.int32(0))
@@ -140,10 +140,6 @@ def follow(params: Any, graph: Any, config: FilterTrainConfig, places: CornerMap
     keys = jax.random.split(k_steps, window.odometry.shape[0])
     first = filter.start(start_poses(k_start, window, config))
     return jax.lax.scan(update, first, (keys, window.ranges, window.odometry))[1]
-
-
-def _frame(places: CornerMap) -> tuple[Array, float]:
-    return places.origin, places.resolution
 
 
 def make_tracker(params: Any, graph: Any, config: FilterTrainConfig, place: CornerMap) -> Learned:

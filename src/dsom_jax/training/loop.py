@@ -78,7 +78,7 @@ class TrainConfig:
         seed: of weights and data.
     """
 
-    model: DSOMConfig = field(default_factory=lambda: _default_model())
+    model: DSOMConfig = field(default_factory=_default_model)
     scan: ScanConfig = ScanConfig()
     world: WorldConfig = WorldConfig()
     maps_share: float = 1.0
@@ -206,14 +206,12 @@ def make_step(config: TrainConfig) -> Callable[[TrainState, Batch, Array], tuple
 
 def world_source(config: TrainConfig, stage: StageConfig, grids: list[OccupancyGrid] | None = None) -> WorldSource:
     """Procedural buildings, crops of ``grids``, which have the model's resolution, or some of both."""
-    if grids and config.maps_share == 1.0:
-        return crop_source(make_pool(grids, stage.cells), stage.cells, config.model.resolution)
     world = replace(config.world, cells=stage.cells, resolution=config.model.resolution)
     procedural = procedural_source(world, config.scan.bare)
     if not grids:
         return procedural
     crops = crop_source(make_pool(grids, stage.cells), stage.cells, config.model.resolution)
-    return mixed_source(crops, procedural, config.maps_share)
+    return crops if config.maps_share == 1.0 else mixed_source(crops, procedural, config.maps_share)
 
 
 def make_batches(config: TrainConfig, grids: list[OccupancyGrid] | None = None) -> Callable[[int, int], Batch]:
