@@ -102,6 +102,14 @@ def load_provenance(directory: str | Path, kind: str = "dsom") -> dict[str, Any]
     return record
 
 
+def tag_of(directory: str | Path) -> str | None:
+    """Name of the folder of the weights that the checkpoint in ``directory`` consists of; None without a checkpoint."""
+    try:
+        return str(json.loads((Path(directory) / PROVENANCE).read_text())["weights"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
 def save_state(directory: str | Path, state: Any) -> None:
     """Write any pytree of arrays; the folder must not exist. Atomic."""
     _save_tree(Path(directory).absolute(), state)

@@ -54,7 +54,9 @@ class Run:
         checkpoint.save_state(self.out / f"state-{step:08d}", state)
         self.write()
         tag = f"weights-{step:08d}"
-        checkpoint.save(self.out, self.model(state), self.provenance(step, metrics), tag)
+        # A checkpoint that is written over in place is broken until it is done; the same step has the same weights.
+        if checkpoint.tag_of(self.out) != tag:
+            checkpoint.save(self.out, self.model(state), self.provenance(step, metrics), tag)
         for old in self.states()[:-2]:
             shutil.rmtree(old, ignore_errors=True)
 
