@@ -17,7 +17,7 @@ LAYERS = (
     ("motion", "sensor", "nn", "simulate"),
     ("proposals", "metrics", "statistics", "run_table"),
     ("filters", "training", "montecarlo"),
-    ("data", "checkpoint", "run_folder", "trained", "plotting", "report", "judging"),
+    ("atomic", "data", "checkpoint", "run_folder", "trained", "plotting", "report", "judging"),
     ("cli", "trainer", "train", "train_filter", "bench", "localize", "evaluate"),
 )
 DEVICE = 5

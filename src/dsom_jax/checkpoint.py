@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import shutil
 import warnings
 from dataclasses import asdict, fields
@@ -20,6 +19,7 @@ import jax
 import orbax.checkpoint.experimental.v1 as ocp
 from flax import nnx
 
+from dsom_jax.atomic import write_atomic
 from dsom_jax.errors import UserError
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.nn import KINDS, evaluation_view, kind_of
@@ -122,12 +122,7 @@ def load_state(directory: str | Path, like: T) -> T:
 
 def write_json(path: Path, record: Any) -> None:
     """Write JSON so that ``path`` holds the old or the new text, never a part."""
-    temporary = path.with_name(path.name + ".new")
-    with temporary.open("w") as file:
-        file.write(json.dumps(record, indent=2) + "\n")
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
+    write_atomic(path, (json.dumps(record, indent=2) + "\n").encode())
 
 
 def packages() -> dict[str, str]:

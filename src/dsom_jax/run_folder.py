@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 import yaml
 
 from dsom_jax import checkpoint
+from dsom_jax.atomic import write_atomic
 from dsom_jax.errors import UserError
 from dsom_jax.training.filter_loop import averaged_filter_model
 from dsom_jax.training.loop import averaged_model, late_start
@@ -166,6 +167,4 @@ def trim_log(path: Path, step: int) -> None:
     """Drop what a killed run wrote to the log after its last saved state."""
     lines = path.read_text().splitlines() if path.exists() else []
     kept = [line for line in lines if line.endswith("}") and json.loads(line)["step"] <= step]
-    temporary = path.with_name(path.name + ".new")
-    temporary.write_text("".join(line + "\n" for line in kept))
-    temporary.replace(path)
+    write_atomic(path, "".join(line + "\n" for line in kept).encode())
