@@ -13,11 +13,11 @@ import dsom_jax
 ROOT = Path(dsom_jax.__file__).parent
 LAYERS = (
     ("types", "geometry", "errors", "checks", "compiling"),
-    ("occupancy", "lidar", "raycast", "resampling", "pose_grid", "episode"),
+    ("occupancy", "lidar", "marching", "raycast", "resampling", "pose_grid", "episode"),
     ("motion", "sensor", "nn", "simulate"),
     ("proposals", "metrics", "statistics", "run_table"),
     ("filters", "training", "montecarlo"),
-    ("data", "checkpoint", "run_folder", "trained", "plotting", "report", "judging"),
+    ("atomic", "data", "checkpoint", "run_folder", "trained", "plotting", "report", "judging"),
     ("cli", "trainer", "train", "train_filter", "bench", "localize", "evaluate"),
 )
 DEVICE = 5

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import json
 import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from evo.tools import file_interface
 
+import tiny_world
 from dsom_jax import localize
 from dsom_jax.errors import run_cli
+from dsom_jax.types import Remembering
 from tiny_log import START, UPDATES, record
 
 KEYS = {
@@ -123,3 +126,20 @@ def test_floor_plans_get_models_of_their_own(call):
     second, _ = call("--map-kind", "drawn", out="drawn")
     assert first["converged"] == 1 and second["map_kind"] == "drawn" != first["map_kind"]
     assert second["e_pos_m_median"] != first["e_pos_m_median"]
+
+
+@pytest.mark.parametrize(
+    ("fields", "proposal"),
+    [
+        ({}, "likelihood_grid"),
+        ({"memory": False}, "likelihood_grid"),
+        ({"proposal": "uniform"}, "uniform"),
+        ({"method": "adam"}, "likelihood_grid"),
+        ({"method": "mcl", "proposal": "hybrid"}, "uniform"),
+    ],
+)
+def test_what_the_summary_says_of_the_filter_is_so(fields, proposal):
+    args = localize.Args(Path("m.yaml"), Path("l.log"), Path("out"), particles=8, **fields)
+    filter = localize.build(args, tiny_world.grid(), tiny_world.LIDAR)
+    assert localize.remembers(args) == isinstance(filter, Remembering) == (fields == {})
+    assert localize.drawn_from(args) == proposal and not localize.needs_network(args)

@@ -13,6 +13,7 @@ import pytest
 import tiny_world
 from dsom_jax.filters.adam_memory import AdamMemory
 from dsom_jax.filters.adam_robust import AdamRobust, RobustConfig
+from dsom_jax.filters.methods import Settings, make_filter
 from dsom_jax.geometry import compose, inverse, wrap_angle
 from dsom_jax.montecarlo import run, run_keys
 from dsom_jax.motion import OdometryMotion
@@ -171,3 +172,41 @@ def test_it_finds_the_robot_keeps_it_and_run_r_is_the_run_alone(filters):
 def test_shares_are_checked(field):
     with pytest.raises(ValueError, match=field):
         MarkovGridConfig(**{field: 1.5})
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0, 2.0, math.nan])
+def test_the_share_of_the_grid_is_checked(filters, share):
+    with pytest.raises(ValueError, match="share"):
+        replace(filters[0], share=share)
+    with pytest.raises(ValueError, match="memory_share"):
+        Settings(memory_share=share)
+
+
+def test_settings_reach_the_share(memory):
+    settings = Settings(memory=True, memory_share=0.3, grid=GRID)
+    built = make_filter("adam_robust", memory.likelihood, tiny_world.grid(), LIDAR, settings)
+    assert isinstance(built, AdamMemory) and built.share == 0.3
+
+
+def test_no_update_without_memory_by_mistake(filters):
+    with pytest.raises(TypeError, match="recall"):
+        filters[0].prepare(jax.tree.map(lambda leaf: leaf[0], tiny_world.drive().inputs))
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_odometry_that_is_no_number_moves_nothing(room, bad):
+    belief = room.begin() * jax.random.uniform(jax.random.key(0), room.begin().shape)
+    ranges = jnp.full(LIDAR.beams, 1.1)
+    spoilt, after = room.recall(belief, Inputs(ranges, jnp.array([0.3, bad, 0.2]), jnp.int32(4)))
+    # A robot that starts there has not moved either.
+    first, expected = room.recall(belief, Inputs(ranges, jnp.zeros(3), jnp.int32(0)))
+    np.testing.assert_array_equal(after, expected)
+    np.testing.assert_array_equal(spoilt.prior.mass, first.prior.mass)
+
+
+def test_a_filter_outlives_odometry_that_is_no_number(filters):
+    episode = tiny_world.drive()
+    spoilt = episode._replace(odometry=episode.odometry.at[3].set(jnp.nan))
+    info = run(filters[0], spoilt, run_keys(3, 0, 6)).info
+    off = np.asarray(info.cluster) - np.asarray(episode.poses)
+    assert (np.hypot(off[..., 0], off[..., 1])[:, -5:] < 0.5).all()

@@ -12,11 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dsom_jax import raycast
+from dsom_jax import marching, raycast
 from dsom_jax.errors import UserError
 from dsom_jax.lidar import LidarConfig
+from dsom_jax.marching import empty_squares
 from dsom_jax.occupancy import from_cells
-from dsom_jax.raycast import RaycastConfig, empty_squares, make_tables
+from dsom_jax.raycast import RaycastConfig, make_tables
 from reference import rays
 
 cast_rays = jax.jit(raycast.cast_rays, static_argnums=2)
@@ -252,7 +253,7 @@ def test_a_wall_of_one_cell_on_a_map_of_more_cells_than_float32_counts():
     squares = np.ones((4, 4200, 4200), np.uint8)  # of one cell each, so that nothing has to be searched for
     squares[:, 4190, 4001] = 0
     x, y = jnp.array([3990.25, 4010.25]), jnp.array([4189.5, 4189.5])
-    reach = raycast.march(jnp.asarray(squares), x, y, jnp.array([0.0, math.pi]), jnp.zeros(1), 30.0)
+    reach = marching.march(jnp.asarray(squares), x, y, jnp.array([0.0, math.pi]), jnp.zeros(1), 30.0)
     # The squares have a border of one cell: the wall lies from 4000 to 4001.
     np.testing.assert_allclose(reach[:, 0], [9.75, 9.25], atol=CELLS)
 

@@ -10,12 +10,12 @@ import pytest
 from dsom_jax.nn import DSOMConfig
 from dsom_jax.occupancy import from_cells
 from dsom_jax.training.batches import ScanConfig
+from dsom_jax.training.descent import learning_rate
 from dsom_jax.training.loop import (
     StageConfig,
     TrainConfig,
     init_state,
     late_start,
-    learning_rate,
     make_batches,
     make_step,
 )

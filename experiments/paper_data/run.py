@@ -20,11 +20,12 @@ import tyro
 import yaml
 
 from dsom_jax import bench, checkpoint, report
+from dsom_jax.atomic import write_atomic
 from dsom_jax.cli import progress_bar
 from dsom_jax.data import RawLog, load_log, load_map
 from dsom_jax.data.cut import splice, thin, to_episode
 from dsom_jax.data.dxf import UNITS
-from dsom_jax.data.files import read_yaml, write_atomic
+from dsom_jax.data.files import read_yaml
 from dsom_jax.data.log import limited
 from dsom_jax.data.suite import Suite
 from dsom_jax.episode import Episode

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import shutil
 import warnings
 from dataclasses import asdict, fields
@@ -20,6 +19,7 @@ import jax
 import orbax.checkpoint.experimental.v1 as ocp
 from flax import nnx
 
+from dsom_jax.atomic import write_atomic
 from dsom_jax.errors import UserError
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.nn import KINDS, evaluation_view, kind_of
@@ -102,6 +102,14 @@ def load_provenance(directory: str | Path, kind: str = "dsom") -> dict[str, Any]
     return record
 
 
+def tag_of(directory: str | Path) -> str | None:
+    """Name of the folder of the weights that the checkpoint in ``directory`` consists of; None without a checkpoint."""
+    try:
+        return str(json.loads((Path(directory) / PROVENANCE).read_text())["weights"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
 def save_state(directory: str | Path, state: Any) -> None:
     """Write any pytree of arrays; the folder must not exist. Atomic."""
     _save_tree(Path(directory).absolute(), state)
@@ -114,12 +122,7 @@ def load_state(directory: str | Path, like: T) -> T:
 
 def write_json(path: Path, record: Any) -> None:
     """Write JSON so that ``path`` holds the old or the new text, never a part."""
-    temporary = path.with_name(path.name + ".new")
-    with temporary.open("w") as file:
-        file.write(json.dumps(record, indent=2) + "\n")
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
+    write_atomic(path, (json.dumps(record, indent=2) + "\n").encode())
 
 
 def packages() -> dict[str, str]:

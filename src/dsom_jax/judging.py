@@ -23,7 +23,7 @@ class Drive(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """Result of one drive and the seconds that it took (compilation excluded)."""
+    """Result of one drive and the seconds that it took; those of the first of several include the compilation."""
 
     drive: Drive
     result: Result

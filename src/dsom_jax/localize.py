@@ -132,9 +132,7 @@ def check_network(args: Args) -> None:
 
 def cut(log: RawLog, args: Args) -> list[Drive]:
     """Segments of the log; with ``--kidnap`` each is followed by the one half the log further."""
-    rows = segment_indices(
-        log, args.segments, args.steps_per_segment or None, args.update_min_d, args.update_min_a
-    )  # fmt: skip
+    rows = segment_indices(log, args.segments, args.steps_per_segment or None, args.update_min_d, args.update_min_a)
     if rows.shape[1] < metrics.HOLD + 1:
         raise UserError(
             f"{log.path}: segments of {rows.shape[1]} updates are too short to judge, need {metrics.HOLD + 1}; "
@@ -161,9 +159,19 @@ def distinct(log: RawLog, rows: np.ndarray, args: Args) -> np.ndarray:
     return kept
 
 
+def drawn_from(args: Args) -> str:
+    """Name of the proposal that the filter draws from, whatever the arguments name: MCL's is uniform."""
+    return "uniform" if args.method == "mcl" else args.proposal
+
+
+def remembers(args: Args) -> bool:
+    """Whether the filter remembers earlier scans on the likelihood grid."""
+    return args.memory and args.method == "adam_robust" and args.proposal == "likelihood_grid"
+
+
 def needs_network(args: Args) -> bool:
     """Whether the filter draws from a trained network."""
-    return args.proposal in ("dsom", "hybrid") and args.method != "mcl"
+    return drawn_from(args) in ("dsom", "hybrid")
 
 
 def network_folder(args: Args) -> Path | None:
@@ -180,10 +188,10 @@ def load_network(args: Args, lidar: LidarConfig) -> Any:
 def build(args: Args, grid: OccupancyGrid, lidar: LidarConfig, network: Any = None) -> Filter:
     """The filter that the arguments ask for."""
     kind = DRAWN if args.map_kind == "drawn" else REAL
-    settings = replace(kind, particles=args.particles, t_cut=args.t_cut, max_beams=args.max_beams, seed=args.seed)
-    settings = replace(settings, memory=args.memory)
-    name = "uniform" if args.method == "mcl" else args.proposal
-    return make_filter(args.method, make_proposal(name, grid, lidar, settings, network), grid, lidar, settings)
+    own = ("particles", "t_cut", "max_beams", "seed", "memory")
+    settings = replace(kind, **{name: getattr(args, name) for name in own})
+    proposal = make_proposal(drawn_from(args), grid, lidar, settings, network)
+    return make_filter(args.method, proposal, grid, lidar, settings)
 
 
 def localize(filter: Filter, drives: Any, runs: int, seed: int) -> list[Outcome]:
@@ -207,7 +215,7 @@ def summarize(outcomes: list[Outcome], grid: OccupancyGrid, args: Args) -> dict[
     timed = outcomes[1:] or outcomes
     head = {
         "map": str(args.map), "log": str(args.log), "map_kind": args.map_kind,
-        "method": args.method, "proposal": args.proposal, "memory": args.memory,
+        "method": args.method, "proposal": drawn_from(args), "memory": remembers(args),
         "particles": args.particles, "segments": len(outcomes), "runs": args.runs, "updates": updates,
         "steps_per_segment": len(outcomes[0].drive.stamps), "seed": args.seed,
         "ms_per_update": 1e3 * float(np.median([o.seconds / len(o.drive.stamps) for o in timed])),

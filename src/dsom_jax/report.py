@@ -13,7 +13,6 @@ from __future__ import annotations
 import io
 import json
 import math
-import os
 import tempfile
 import zipfile
 from collections.abc import Callable
@@ -25,6 +24,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from dsom_jax.atomic import write_atomic
 from dsom_jax.errors import UserError
 from dsom_jax.run_table import RunTable
 
@@ -46,24 +46,14 @@ def output_folder(path: str | Path) -> Path:
 
 def write_text(path: Path, text: str) -> None:
     """Write ``path`` whole or not at all."""
-    write_bytes(path, text.encode())
-
-
-def write_bytes(path: Path, content: bytes) -> None:
-    """Write ``path`` whole or not at all: a file beside it, then a rename."""
-    draft = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        draft.write_bytes(content)
-        draft.replace(path)
-    finally:
-        draft.unlink(missing_ok=True)
+    write_atomic(path, text.encode())
 
 
 def write_runs(path: Path, table: RunTable) -> None:
     """Write the columns of ``table`` to ``path`` (npz), atomically."""
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **table._asdict())
-    write_bytes(path, buffer.getvalue())
+    write_atomic(path, buffer.getvalue())
 
 
 def read_runs(path: str | Path) -> RunTable:

@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 import yaml
 
 from dsom_jax import checkpoint
+from dsom_jax.atomic import write_atomic
 from dsom_jax.errors import UserError
 from dsom_jax.training.filter_loop import averaged_filter_model
 from dsom_jax.training.loop import averaged_model, late_start
@@ -54,7 +55,9 @@ class Run:
         checkpoint.save_state(self.out / f"state-{step:08d}", state)
         self.write()
         tag = f"weights-{step:08d}"
-        checkpoint.save(self.out, self.model(state), self.provenance(step, metrics), tag)
+        # A checkpoint that is written over in place is broken until it is done; the same step has the same weights.
+        if checkpoint.tag_of(self.out) != tag:
+            checkpoint.save(self.out, self.model(state), self.provenance(step, metrics), tag)
         for old in self.states()[:-2]:
             shutil.rmtree(old, ignore_errors=True)
 
@@ -164,6 +167,4 @@ def trim_log(path: Path, step: int) -> None:
     """Drop what a killed run wrote to the log after its last saved state."""
     lines = path.read_text().splitlines() if path.exists() else []
     kept = [line for line in lines if line.endswith("}") and json.loads(line)["step"] <= step]
-    temporary = path.with_name(path.name + ".new")
-    temporary.write_text("".join(line + "\n" for line in kept))
-    temporary.replace(path)
+    write_atomic(path, "".join(line + "\n" for line in kept).encode())

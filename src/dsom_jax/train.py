@@ -109,7 +109,18 @@ def resume_run(args: Arguments, path: Path) -> Run:
     run = reopen(Run, path, lambda given: override(TrainConfig(), given, str(path)), args.maps, args.steps)
     if args.config is not None and read_config(args.config) != run.config:
         raise UserError(f"{args.config}: differs from the run in {path}; resume without --config")
+    check_init(args.init, run, path)
     return run
+
+
+def check_init(init: Path | None, run: Run, path: Path) -> None:
+    """UserError for another ``--init`` than the run's, or none where it is still needed; says if it is not read."""
+    if init is not None and init.name != run.init:
+        raise UserError(f"--init {init}: the run in {path} began with {run.init or 'fresh weights'}; resume without it")
+    if init is None and run.init is not None and not run.states():
+        raise UserError(f"{path}: the run begins with {run.init} and has saved no state yet; give --init, too")
+    if init is not None and run.states():
+        print(f"--init {init}: not read, the run goes on from {run.states()[-1]}")
 
 
 def first_state(run: Run, network: DSOM | None) -> TrainState:

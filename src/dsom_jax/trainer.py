@@ -80,14 +80,14 @@ class Trainer:
 
     def __init__(self, options: Options, run: Run, parts: Parts) -> None:
         self.options, self.run, self.parts = options, run, parts
-        self.state = parts.state
+        self.state, self.first = parts.state, int(parts.state.step)
         self.saved_at = time.monotonic()
         self.clock = time.monotonic()
-        trim_log(log_path(run), int(self.state.step))
+        trim_log(log_path(run), self.first)
 
     def train(self, progress: Progress) -> dict[str, Any]:
         """Steps until the end; returns the last evaluation."""
-        first = done = int(self.state.step)
+        done = self.first
         task = progress.add_task("training", total=self.run.total, completed=done, note="compiling")
         batch = self.parts.batches(done, self.total())
         with log_path(self.run).open("a") as log:
@@ -97,11 +97,11 @@ class Trainer:
                 # The next batch is made while the step runs.
                 batch = self.parts.batches(done, self.total())
                 values = {name: float(value) for name, value in metrics.items()}
-                spent = self.tick(done - first)
+                spent = self.tick(done)
                 log.write(json.dumps({"step": done, **values, "seconds": round(self.run.seconds, 3)}) + "\n")
                 log.flush()
                 progress.update(task, completed=done, total=self.run.total, note=self.note(values, done, spent))
-                if self.due(done):
+                if self.due(done) and done < self.total():
                     self.save(progress)
         return self.save(progress)
 
@@ -115,23 +115,24 @@ class Trainer:
         """Steps of the run; far away until calibrated."""
         return self.run.total or 2**30
 
-    def tick(self, count: int) -> float:
-        """Account for the time of a step; with ``minutes`` decide on the number of steps. Returns its seconds."""
+    def tick(self, done: int) -> float:
+        """Account for the time of step ``done``, and return it; with ``minutes`` decide on the number of steps."""
         now = time.monotonic()
         spent, self.clock = now - self.clock, now
         self.run.seconds += spent
         if self.run.total is None:
-            self.calibrate(count, now)
+            self.calibrate(done, now)
         return spent
 
-    def calibrate(self, count: int, now: float) -> None:
-        """Number of steps that fit the minutes given, from the steps after compilation."""
+    def calibrate(self, done: int, now: float) -> None:
+        """Number of steps that fit the minutes given, from the steps of this process after compilation."""
+        count = done - self.first
         if count == 5:
             self.calibration_start = now
         elif count == 5 + CALIBRATION_STEPS:
             per_step = (now - self.calibration_start) / CALIBRATION_STEPS
             left = 60 * self.options.minutes * 0.95 - self.run.seconds
-            self.run.total = max(count + int(left / per_step), count + 1)
+            self.run.total = max(done + int(left / per_step), done + 1)
             self.run.write()
 
     def due(self, done: int) -> bool:

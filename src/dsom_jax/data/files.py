@@ -1,11 +1,9 @@
-"""Reading and writing whole files: clear errors, nothing half-written."""
+"""Reading whole files, with clear errors."""
 
 from __future__ import annotations
 
 import bz2
 import gzip
-import os
-import tempfile
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
@@ -51,16 +49,3 @@ def read_yaml(path: str | Path, what: str) -> dict[str, Any]:
     if not isinstance(document, Mapping):
         raise UserError(f"{path}: holds no fields; the {what} must be a list of 'field: value' lines")
     return {str(key): value for key, value in document.items()}
-
-
-def write_atomic(path: str | Path, content: bytes) -> None:
-    """Write a file so that it is either complete or not there; its folder is made where needed."""
-    path = Path(path)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:
-            whole = Path(folder) / "whole"
-            whole.write_bytes(content)
-            os.replace(whole, path)
-    except OSError as error:
-        raise UserError(f"{path}: cannot be written ({error.strerror}); choose another output folder") from None

@@ -79,6 +79,8 @@ def _scan_file(path: Path) -> Path:
     """The one SICK file that is meant."""
     if path.is_dir():
         found = list(_scan_files(path))
+        if not found:
+            raise UserError(f"{path}: holds no *-SICK_FRONT.csv nor *-SICK_REAR.csv; give the folder of a session")
         sessions = {p.name.split("-SICK_")[0] for p in found}
         if len(sessions) > 1:
             raise UserError(f"{path}: holds several sessions ({', '.join(sorted(sessions))}); name a SICK file")

@@ -16,7 +16,8 @@ from typing import Any, Literal, get_args
 import cv2
 import numpy as np
 
-from dsom_jax.data.files import read_bytes, read_yaml, write_atomic
+from dsom_jax.atomic import write_atomic
+from dsom_jax.data.files import read_bytes, read_yaml
 from dsom_jax.data.pgm import decode_pgm, encode_pgm
 from dsom_jax.errors import UserError
 from dsom_jax.occupancy import OccupancyGrid, from_cells

@@ -29,7 +29,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dsom_jax.data.files import read_bytes, write_atomic
+from dsom_jax.atomic import write_atomic
+from dsom_jax.data.files import read_bytes
 from dsom_jax.data.open_map import load_map
 from dsom_jax.episode import Episode
 from dsom_jax.errors import UserError

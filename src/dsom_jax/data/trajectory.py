@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from dsom_jax.atomic import write_atomic
 from dsom_jax.data import se2
-from dsom_jax.data.files import read_bytes, write_atomic
+from dsom_jax.data.files import read_bytes
 from dsom_jax.data.log import RawLog
 from dsom_jax.errors import UserError
 

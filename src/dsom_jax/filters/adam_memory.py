@@ -11,11 +11,12 @@ Particles refine what the grid is too coarse for; the grid carries the places th
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NoReturn
 
 import jax
 import jax.numpy as jnp
 
+from dsom_jax import checks
 from dsom_jax.filters.adam_robust import AdamRobust, RobustState
 from dsom_jax.occupancy import is_free
 from dsom_jax.proposals.markov_grid import MarkovGrid, Recollection
@@ -34,6 +35,13 @@ class AdamMemory(AdamRobust):
 
     proposal: MarkovGrid
     share: float = field(default=0.5, metadata={"static": True})
+
+    def __post_init__(self) -> None:
+        checks.share(self, "share", excluding="()")
+
+    def prepare(self, inputs: Inputs) -> NoReturn:
+        """TypeError: one scan alone is not what this filter's updates need; it would forget all the others."""
+        raise TypeError("AdamMemory: the proposal has a past; call begin() and recall() in place of prepare()")
 
     def begin(self) -> Any:
         """Memory before the first update."""

@@ -94,7 +94,7 @@ class AdamRobust:
         tables: the map.
         space: uniform distribution over its free poses, u.
         proposal: samplable observation model, q; wherever it has mass zero, the filter cannot find the robot anew.
-        lidar: beams that are used (static); ``beam_step`` - 1 beams of the scan are skipped between them (static).
+        lidar: beams that are used (static); every ``beam_step``-th of the scan (static).
         motion: model of the drive (static).
         config: static.
     """

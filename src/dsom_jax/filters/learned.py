@@ -37,7 +37,7 @@ class Learned:
         space: uniform distribution over its free poses.
         prior: where the particles start; None: anywhere in free space.
         graph: structure of the network (static).
-        lidar: beams that are used (static); ``beam_step`` of the scan's beams are skipped between them (static).
+        lidar: beams that are used (static); every ``beam_step``-th of the scan (static).
         particles: N (static).
     """
 

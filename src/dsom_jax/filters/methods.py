@@ -76,6 +76,7 @@ class Settings:
         hybrid: weights of likelihood grid and network.
         robust, robust_motion, robust_raycast: AdaM robust; its ``particles`` are those above.
         memory: AdaM robust with the likelihood grid as proposal remembers earlier scans on the grid.
+        memory_share: weight of what that memory says, beside the particles' own past.
         markov: how that memory moves.
     """
 
@@ -93,12 +94,14 @@ class Settings:
     robust_motion: Motion = OdometryMotion(0.01, 0.01, 0.01, 0.01, 0.02, 0.015, slip=0.1, tail=0.4, tail_scale=4.0)
     robust_raycast: RaycastConfig = RaycastConfig("table")
     memory: bool = False
+    memory_share: float = 0.5
     markov: MarkovGridConfig = MarkovGridConfig()
 
     def __post_init__(self) -> None:
         checks.count(self, "particles max_beams")
         checks.count(self, "seed", 0)
         checks.share(self, "t_cut")
+        checks.share(self, "memory_share", excluding="()")
         checks.positive(self, "sharpness")
 
 
@@ -194,7 +197,7 @@ def make_filter(
         tables = make_tables(grid, settings.robust_raycast, lidar.range_max)
         parts = (used, step, settings.robust_motion, robust)
         if settings.memory and isinstance(proposal, LikelihoodGrid):
-            return AdamMemory(tables, space, MarkovGrid(proposal, settings.markov), *parts)
+            return AdamMemory(tables, space, MarkovGrid(proposal, settings.markov), *parts, settings.memory_share)
         return AdamRobust(tables, space, proposal, *parts)
     score = replace(settings.score, range_max=lidar.range_max)
     tables = make_tables(grid, settings.raycast, lidar.range_max)

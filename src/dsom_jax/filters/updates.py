@@ -50,7 +50,7 @@ class World:
     Attributes:
         tables: the map.
         space: uniform distribution over its free poses.
-        lidar: beams that are used (static); ``beam_step`` of the scan's beams are skipped between them (static).
+        lidar: beams that are used (static); every ``beam_step``-th of the scan (static).
         motion, score: models (static).
     """
 
@@ -185,7 +185,7 @@ def mixture_update(
     config: FilterConfig,
 ) -> tuple[ParticleState, Info]:
     """MCL update of the particles ``high`` (N,), dual MCL update of the others (Alg 1, lines 10 to 21)."""
-    k_high, k_low, _ = jax.random.split(key, 3)
+    k_high, k_low = jax.random.split(key)
     trusted = mcl_update(k_high, state, high, inputs, world, config)
     redrawn = dual_update(k_low, state, inputs, world, proposal, prepared, config)
     return mix(state, high, trusted, redrawn, redrawn.poses)

@@ -66,11 +66,17 @@ class DSOMConfig:
 
     def misfit(self, lidar: LidarConfig) -> str | None:
         """Why scans of ``lidar`` are not what the network was trained for, or None."""
-        if lidar.fov < self.fov_min - 0.02:
-            fov, least = math.degrees(lidar.fov), math.degrees(self.fov_min)
-            return f"field of view {fov:.0f} deg, trained for {least:.0f} or more"
-        if lidar.range_max < self.reach_min - 1e-3:
-            return f"range_max {lidar.range_max:g} m, trained for {self.reach_min:g} m or more"
+        if less := lacking(lidar, self.fov_min, self.reach_min):
+            return less
         if lidar.fov / lidar.beams > 4 * math.pi / self.headings:
             return f"{lidar.beams} beams are fewer than one in two of the {self.headings} headings"
         return None
+
+
+def lacking(lidar: LidarConfig, fov_min: float, reach_min: float) -> str | None:
+    """What scans of ``lidar`` lack of a field of view (radians) and a reach (metres) that were trained for, or None."""
+    if lidar.fov < fov_min - 0.02:
+        return f"field of view {math.degrees(lidar.fov):.0f} deg, trained for {math.degrees(fov_min):.0f} or more"
+    if lidar.range_max < reach_min - 1e-3:
+        return f"range_max {lidar.range_max:g} m, trained for {reach_min:g} m or more"
+    return None

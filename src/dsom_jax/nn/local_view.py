@@ -17,6 +17,7 @@ from dsom_jax import checks
 from dsom_jax.errors import UserError
 from dsom_jax.geometry import rotate
 from dsom_jax.lidar import LidarConfig, scan_points
+from dsom_jax.nn.config import lacking
 from dsom_jax.occupancy import OccupancyGrid, resample
 from dsom_jax.types import Array
 
@@ -64,11 +65,8 @@ class ViewConfig:
 
     def misfit(self, lidar: LidarConfig) -> str | None:
         """Why scans of ``lidar`` are not what the network was trained for, or None."""
-        if lidar.fov < self.fov_min - 0.02:
-            fov, least = math.degrees(lidar.fov), math.degrees(self.fov_min)
-            return f"field of view {fov:.0f} deg, trained for {least:.0f} or more"
-        if lidar.range_max < self.reach_min - 1e-3:
-            return f"range_max {lidar.range_max:g} m, trained for {self.reach_min:g} m or more"
+        if less := lacking(lidar, self.fov_min, self.reach_min):
+            return less
         if lidar.beams < self.beams // 2:
             return f"{lidar.beams} beams, trained for {self.beams // 2} or more"
         return None

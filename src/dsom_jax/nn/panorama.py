@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
+from dsom_jax.marching import empty_squares, march
 from dsom_jax.nn.config import DSOMConfig
 from dsom_jax.nn.layers import CircularBlock, Dense
 from dsom_jax.nn.polar import bin_centres, range_features
-from dsom_jax.raycast import empty_squares, march
 from dsom_jax.types import Array
 
 STRIDE = 2

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from dsom_jax.atomic import write_atomic
+
 
 def save(figure: Figure, path: Path) -> None:
     """Write PNG at 150 dpi or PDF, as the ending of ``path`` says, whole or not at all."""
-    draft = path.with_name(f".{path.name}")
-    figure.savefig(draft, format=path.suffix[1:], dpi=150)
-    draft.replace(path)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format=path.suffix[1:], dpi=150)
+    write_atomic(path, buffer.getvalue())
 
 
 def panels(count: int, width: float, height: float, sharey: bool = False) -> tuple[Figure, list[Axes]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import jax
@@ -123,14 +123,11 @@ def with_episode(proposal: DualFeatures, episode: Episode) -> DualFeatures:
     features, cells = _described(proposal.pose_grid, episode.ranges, episode.poses, proposal.lidar)
     updates = jnp.arange(len(cells), dtype=jnp.int32)
     left = min(len(updates), len(proposal.cells))
-    return DualFeatures(
-        jnp.concatenate([proposal.features[left:], features]),
-        jnp.concatenate([proposal.cells[left:], cells]),
-        jnp.concatenate([proposal.updates[left:], updates]),
-        proposal.free,
-        proposal.pose_grid,
-        proposal.lidar,
-        proposal.config,
+    return replace(
+        proposal,
+        features=jnp.concatenate([proposal.features[left:], features]),
+        cells=jnp.concatenate([proposal.cells[left:], cells]),
+        updates=jnp.concatenate([proposal.updates[left:], updates]),
     )
 
 

@@ -42,7 +42,7 @@ class LikelihoodGridConfig:
     angles_per_heading: int = 4
     beams: int = 120
     raycast: RaycastConfig = RaycastConfig("exact")
-    model: BeamModel = field(default_factory=lambda: BeamModel(sigma_hit=0.15, temper=0.5))
+    model: BeamModel = BeamModel(sigma_hit=0.15, temper=0.5)
 
     def __post_init__(self) -> None:
         checks.positive(self, "resolution")

@@ -70,7 +70,10 @@ class MarkovGrid:
 
     def recall(self, belief: Array, inputs: Inputs) -> tuple[Recollection, Array]:
         """Belief (C, K) of the update before -> PMs of this one, and its belief."""
-        moved = jnp.where(inputs.index == 0, belief, self.predict(belief, inputs.odometry))
+        # An increment that is not a number tells nothing, and would make all beliefs to come none: nothing moves.
+        known = jnp.isfinite(inputs.odometry).all()
+        still = (inputs.index == 0) | ~known
+        moved = jnp.where(still, belief, self.predict(belief, jnp.where(known, inputs.odometry, 0.0)))
         prior = (1 - self.config.kidnap) * normalised(moved) + self.config.kidnap * self.begin()
         log_prior = jnp.log(prior)
         log_posterior = log_prior + self.likelihood.log_likelihood(inputs.ranges)
@@ -79,7 +82,7 @@ class MarkovGrid:
         return Recollection(*maps), normalised(posterior)
 
     def prepare(self, inputs: Inputs) -> Recollection:
-        """PMs of a scan that is the first one."""
+        """PMs of a scan taken for the first one: without memory, whatever was seen before."""
         return self.recall(self.begin(), inputs._replace(index=jnp.zeros_like(inputs.index)))[0]
 
     def sample(self, key: Key, prepared: Recollection, n: int) -> tuple[Array, Array]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
@@ -18,8 +19,10 @@ from dsom_jax.nn.dsom import masked_log_softmax, one_scan
 from dsom_jax.training.batches import Batch
 from dsom_jax.types import Array
 
-MASS_POSITION, MASS_HEADING = 1.0, float(np.deg2rad(15))
-TOP_POSITION, TOP_HEADING = 2.0, float(np.deg2rad(10))
+MASS = 1.0, math.radians(15)
+"""Metres and radians about the truth within which probability counts as being at the right place."""
+TOP = 2.0, math.radians(10)
+"""Within which the most probable cell counts as right."""
 
 
 class Score(NamedTuple):
@@ -27,7 +30,7 @@ class Score(NamedTuple):
 
     Attributes:
         mass: () probability within 1 m and 15 deg of the truth.
-        top1: () bool, the most probable cell is within 2 m and 10 deg (half a heading bin at least).
+        top1: () bool, the most probable cell is within 2 m and 10 deg.
     """
 
     mass: Array
@@ -41,9 +44,9 @@ def score_map(log_pm: Array, pose: Array, resolution: float) -> Score:
     y = (jnp.arange(h) + 0.5) * resolution - pose[1]
     turn = jnp.abs(wrap_angle(-jnp.pi + jnp.arange(k) * (2 * jnp.pi / k) - pose[2]))
     distance = jnp.hypot(x[None, :], y[:, None])
-    near = (distance <= MASS_POSITION)[..., None] & (turn <= MASS_HEADING)
+    near = (distance <= MASS[0])[..., None] & (turn <= MASS[1])
     i, j, best = jnp.unravel_index(jnp.argmax(log_pm), log_pm.shape)
-    top1 = (distance[i, j] < TOP_POSITION) & (turn[best] < TOP_HEADING)
+    top1 = (distance[i, j] < TOP[0]) & (turn[best] < TOP[1])
     return Score(jnp.where(near, jnp.exp(log_pm), 0.0).sum(), top1)
 
 

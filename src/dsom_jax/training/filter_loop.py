@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import optax
 from flax import nnx
 
 from dsom_jax import checks
@@ -21,8 +20,8 @@ from dsom_jax.nn.kinds import KINDS, kind_of
 from dsom_jax.nn.local_view import CornerMap, pack_corners
 from dsom_jax.nn.pf_net import PFNetConfig
 from dsom_jax.nn.pfrnn import PFRNNConfig
+from dsom_jax.training.descent import descend, follow_average, optimizer
 from dsom_jax.training.filter_loss import FilterLosses, particle_loss, prediction_loss
-from dsom_jax.training.loop import learning_rate, optimizer
 from dsom_jax.training.sequences import PathPool, SequenceConfig, Window
 from dsom_jax.types import Array, Inputs, Key
 
@@ -130,7 +129,7 @@ def start_poses(key: Key, window: Window, config: FilterTrainConfig) -> Array:
 def follow(params: Any, graph: Any, config: FilterTrainConfig, places: CornerMap, key: Key, window: Window) -> Any:
     """States of the filter after each update of a sequence, leaves (L, ...)."""
     k_start, k_steps = jax.random.split(key)
-    filter: Any = make_tracker(params, graph, config, CornerMap(places.codes[window.where], *_frame(places)))
+    filter: Any = make_tracker(params, graph, config, replace(places, codes=places.codes[window.where]))
 
     def update(state: Any, now: tuple[Key, Array, Array]) -> tuple[Any, Any]:
         inputs = Inputs(now[1], now[2], jnp.int32(0))
@@ -140,10 +139,6 @@ def follow(params: Any, graph: Any, config: FilterTrainConfig, places: CornerMap
     keys = jax.random.split(k_steps, window.odometry.shape[0])
     first = filter.start(start_poses(k_start, window, config))
     return jax.lax.scan(update, first, (keys, window.ranges, window.odometry))[1]
-
-
-def _frame(places: CornerMap) -> tuple[Array, float]:
-    return places.origin, places.resolution
 
 
 def make_tracker(params: Any, graph: Any, config: FilterTrainConfig, place: CornerMap) -> Learned:
@@ -181,7 +176,7 @@ def stack_maps(pool: PathPool, resolution: float) -> CornerMap:
 
 def make_filter_step(config: FilterTrainConfig, places: CornerMap) -> Callable[..., Any]:
     """The jitted step: (state, batch, total steps) -> (state, metrics). The state given is consumed."""
-    graph, transform, root = graph_of(config), optimizer(config), jax.random.key(config.seed + 2)
+    graph, root = graph_of(config), jax.random.key(config.seed + 2)
 
     def objective(params: Any, key: Key, windows: Window) -> tuple[Array, FilterLosses]:
         losses = batch_losses(params, graph, config, places, key, windows)
@@ -190,13 +185,8 @@ def make_filter_step(config: FilterTrainConfig, places: CornerMap) -> Callable[.
     def step(state: FilterTrainState, windows: Window, total: Array) -> tuple[FilterTrainState, dict[str, Array]]:
         key = jax.random.fold_in(root, state.step)
         (_, losses), gradient = jax.value_and_grad(objective, has_aux=True)(state.params, key, windows)
-        update, moments = transform.update(gradient, state.optimizer, state.params)
-        rate = learning_rate(config, state.step, total)
-        params = jax.tree.map(lambda p, u: p - rate * u, state.params, update)
-        # Early on the average follows faster, so that it does not remember the fresh weights.
-        decay = jnp.minimum(config.ema, (1.0 + state.step) / (10.0 + state.step))
-        average = jax.tree.map(lambda a, b: decay * a + (1 - decay) * b, state.average, params)
-        metrics = {**losses._asdict(), "rate": rate, "gradient": optax.global_norm(gradient)}
-        return FilterTrainState(state.step + 1, params, moments, average), metrics
+        params, moments, facts = descend(config, state.step, total, state.params, state.optimizer, gradient)
+        average = follow_average(config, state.step, state.average, params)
+        return FilterTrainState(state.step + 1, params, moments, average), {**losses._asdict(), **facts}
 
     return jax.jit(step, donate_argnums=0, compiler_options=training_options())

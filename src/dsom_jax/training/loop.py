@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import optax
 from flax import nnx
 
 from dsom_jax import checks
@@ -27,6 +26,7 @@ from dsom_jax.training.batches import (
     mixed_source,
     procedural_source,
 )
+from dsom_jax.training.descent import descend, follow_average, optimizer
 from dsom_jax.training.loss import Losses, dsom_losses
 from dsom_jax.training.target import make_target
 from dsom_jax.types import Array
@@ -78,7 +78,7 @@ class TrainConfig:
         seed: of weights and data.
     """
 
-    model: DSOMConfig = field(default_factory=lambda: _default_model())
+    model: DSOMConfig = field(default_factory=_default_model)
     scan: ScanConfig = ScanConfig()
     world: WorldConfig = WorldConfig()
     maps_share: float = 1.0
@@ -121,34 +121,6 @@ class TrainState(NamedTuple):
     average: Any
 
 
-class Schedule(Protocol):
-    """The part of a configuration that says how to descend; every kind of network has it."""
-
-    @property
-    def learning_rate(self) -> float:
-        """Peak of Adam's rate."""
-
-    @property
-    def warmup(self) -> int:
-        """Steps to the peak."""
-
-    @property
-    def clip(self) -> float:
-        """Largest norm of the gradient."""
-
-
-def optimizer(config: Schedule) -> optax.GradientTransformation:
-    """Clip and Adam; the rate is applied by the step because the number of steps is not static."""
-    return optax.chain(optax.clip_by_global_norm(config.clip), optax.scale_by_adam())
-
-
-def learning_rate(config: Schedule, step: Array, total: Array) -> Array:
-    """Linear warm-up, then half a cosine down to zero at ``total``."""
-    progress = jnp.clip((step - config.warmup) / jnp.maximum(total - config.warmup, 1), 0.0, 1.0)
-    warm = jnp.minimum((step + 1) / max(config.warmup, 1), 1.0)
-    return config.learning_rate * warm * 0.5 * (1 + jnp.cos(jnp.pi * progress))
-
-
 def split_model(model: DSOM) -> tuple[Any, Any, Any]:
     """Graph definition, pure params and pure batch statistics."""
     parts: Any = nnx.split(model, nnx.Param, nnx.BatchStat)
@@ -183,7 +155,6 @@ def batch_losses(model: DSOM, batch: Batch, config: TrainConfig) -> Losses:
 def make_step(config: TrainConfig) -> Callable[[TrainState, Batch, Array], tuple[TrainState, dict[str, Array]]]:
     """The jitted step: (state, batch, total steps) -> (state, metrics). The state given is consumed."""
     graphdef = split_model(nnx.eval_shape(lambda: create(config.model)))[0]
-    transform = optimizer(config)
 
     def objective(params: Any, stats: Any, batch: Batch) -> tuple[Array, tuple[Losses, Any]]:
         model = nnx.merge(graphdef, params, stats)
@@ -192,28 +163,21 @@ def make_step(config: TrainConfig) -> Callable[[TrainState, Batch, Array], tuple
 
     def step(state: TrainState, batch: Batch, total: Array) -> tuple[TrainState, dict[str, Array]]:
         (_, (losses, stats)), gradient = jax.value_and_grad(objective, has_aux=True)(state.params, state.stats, batch)
-        update, moments = transform.update(gradient, state.optimizer, state.params)
-        rate = learning_rate(config, state.step, total)
-        params = jax.tree.map(lambda p, u: p - rate * u, state.params, update)
-        # Early on the average follows faster, so that it does not remember the fresh weights.
-        decay = jnp.minimum(config.ema, (1.0 + state.step) / (10.0 + state.step))
-        average = jax.tree.map(lambda a, b: decay * a + (1 - decay) * b, state.average, (params, stats))
-        metrics = {**losses._asdict(), "rate": rate, "gradient": optax.global_norm(gradient)}
-        return TrainState(state.step + 1, params, stats, moments, average), metrics
+        params, moments, facts = descend(config, state.step, total, state.params, state.optimizer, gradient)
+        average = follow_average(config, state.step, state.average, (params, stats))
+        return TrainState(state.step + 1, params, stats, moments, average), {**losses._asdict(), **facts}
 
     return jax.jit(step, donate_argnums=0, compiler_options=training_options())
 
 
 def world_source(config: TrainConfig, stage: StageConfig, grids: list[OccupancyGrid] | None = None) -> WorldSource:
     """Procedural buildings, crops of ``grids``, which have the model's resolution, or some of both."""
-    if grids and config.maps_share == 1.0:
-        return crop_source(make_pool(grids, stage.cells), stage.cells, config.model.resolution)
     world = replace(config.world, cells=stage.cells, resolution=config.model.resolution)
     procedural = procedural_source(world, config.scan.bare)
     if not grids:
         return procedural
     crops = crop_source(make_pool(grids, stage.cells), stage.cells, config.model.resolution)
-    return mixed_source(crops, procedural, config.maps_share)
+    return crops if config.maps_share == 1.0 else mixed_source(crops, procedural, config.maps_share)
 
 
 def make_batches(config: TrainConfig, grids: list[OccupancyGrid] | None = None) -> Callable[[int, int], Batch]:

@@ -16,13 +16,10 @@ from dsom_jax.compiling import run_options
 from dsom_jax.geometry import wrap_angle
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.training import evaluation
+from dsom_jax.training.evaluation import MASS, TOP
 from dsom_jax.training.target import dense, make_target
 from dsom_jax.types import Array, Inputs, Proposal
 
-MASS = 1.0, math.radians(15)
-"""Metres and radians about the truth within which probability counts as being at the right place."""
-TOP = 2.0, math.radians(10)
-"""Within which the most probable pose counts as right."""
 PEAK = 2.0, math.radians(30)
 """Two peaks are further apart than this."""
 MAX_PEAKS = 8
