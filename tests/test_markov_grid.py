@@ -174,7 +174,7 @@ def test_shares_are_checked(field):
         MarkovGridConfig(**{field: 1.5})
 
 
-@pytest.mark.parametrize("share", [0.0, 1.0, 2.0, math.nan])
+@pytest.mark.parametrize("share", [(0.0, 0.5), (0.1, 1.0), (0.5, 0.1), (math.nan, 0.5), (0.5,), 0.5])
 def test_the_share_of_the_grid_is_checked(filters, share):
     with pytest.raises(ValueError, match="share"):
         replace(filters[0], share=share)
@@ -182,10 +182,26 @@ def test_the_share_of_the_grid_is_checked(filters, share):
         Settings(memory_share=share)
 
 
-def test_settings_reach_the_share(memory):
-    settings = Settings(memory=True, memory_share=0.3, grid=GRID)
+def test_settings_reach_the_memory(memory):
+    settings = Settings(memory=True, memory_share=(0.2, 0.3), memory_temper=0.07, grid=GRID)
     built = make_filter("adam_robust", memory.likelihood, tiny_world.grid(), LIDAR, settings)
-    assert isinstance(built, AdamMemory) and built.share == 0.3
+    assert isinstance(built, AdamMemory) and built.share == (0.2, 0.3)
+    ranges = tiny_world.drive().inputs.ranges[0]
+    untempered = memory.likelihood.log_likelihood(ranges) / GRID.model.temper
+    np.testing.assert_allclose(built.proposal.likelihood.log_likelihood(ranges), 0.07 * untempered, rtol=1e-5)
+    assert memory.likelihood.config.model.temper == GRID.model.temper
+
+
+def test_what_the_memory_says_counts_as_much_as_the_filter_is_lost(filters):
+    """With the share at both of its ends, and between them."""
+    prepared = filters[0].proposal.prepare(jax.tree.map(lambda leaf: leaf[0], tiny_world.drive().inputs))
+    state = filters[0].init(jax.random.key(0))._replace(updates=jnp.int32(3))
+    poses = tiny_world.drive().poses[:1]
+    prior = filters[0].proposal.log_prior(prepared, poses)
+    for lost, share in [(0.0, 0.01), (0.2, 0.2), (0.9, 0.5)]:
+        state = state._replace(lost=jnp.float32(lost))
+        said = filters[0]._log_redrawn(state, poses, prepared) - prior
+        np.testing.assert_allclose([said[0], filters[0]._log_kept(state)], np.log([share, 1 - share]), rtol=1e-5)
 
 
 def test_no_update_without_memory_by_mistake(filters):

@@ -43,6 +43,13 @@ def share(config: Any, names: str, *, excluding: str = "") -> None:
     within(config, names, 0, 1, f"give a share{edges.get(excluding, ' from 0 to 1')}", excluding=excluding)
 
 
+def span(config: Any, name: str) -> None:
+    """ValueError unless the field is a pair of shares, the least and the greatest, neither of them 0 or 1."""
+    value = getattr(config, name)
+    if not (isinstance(value, tuple) and len(value) == 2 and all(map(_number, value)) and 0 < value[0] <= value[1] < 1):
+        raise ValueError(message(config, name, "give two shares between 0 and 1, the least and the greatest"))
+
+
 def count(config: Any, names: str, least: int = 1) -> None:
     """ValueError unless the fields are whole numbers from ``least`` on."""
     for name in names.split():

@@ -1,7 +1,8 @@
 """AdaM robust with a proposal that remembers: the whole history speaks for a redrawn place, not this scan alone.
 
 Both components now estimate the same posterior: H from the particles of the last update, L from the belief b- on the
-grid, which holds the kidnapping prior. They are averaged with the weights 1 - a and a:
+grid, which holds the kidnapping prior. They are averaged with the weights 1 - a and a, where a
+follows the probability of being lost, as the number of redrawn particles does:
 
     H: (1 - a) p(z | x) w / (r N_H)        L: a b-(x) p(z | x) / (q(x) N_L)
 
@@ -30,14 +31,14 @@ class AdamMemory(AdamRobust):
 
     Attributes:
         proposal: the likelihood grid with its belief.
-        share: a, weight of what the grid says (static).
+        share: least and greatest a, weight of what the grid says (static).
     """
 
     proposal: MarkovGrid
-    share: float = field(default=0.5, metadata={"static": True})
+    share: tuple[float, float] = field(default=(0.01, 0.5), metadata={"static": True})
 
     def __post_init__(self) -> None:
-        checks.share(self, "share", excluding="()")
+        checks.span(self, "share")
 
     def prepare(self, inputs: Inputs) -> NoReturn:
         """TypeError: one scan alone is not what this filter's updates need; it would forget all the others."""
@@ -51,13 +52,17 @@ class AdamMemory(AdamRobust):
         """The proposal for this update, and the memory after it."""
         return self.proposal.recall(memory, inputs)
 
-    def _log_kept(self) -> Array:
+    def _share(self, state: RobustState) -> Array:
+        """a ()."""
+        return jnp.clip(state.lost, *self.share)
+
+    def _log_kept(self, state: RobustState) -> Array:
         """log(1 - a)."""
-        return jnp.log1p(-self.share)
+        return jnp.log1p(-self._share(state))
 
     def _log_redrawn(self, state: RobustState, poses: Array, prepared: Recollection) -> Array:
         """log(a b-(x)); at the first update all is redrawn."""
-        share = jnp.where(state.updates == 0, 0.0, jnp.log(self.share))
+        share = jnp.where(state.updates == 0, 0.0, jnp.log(self._share(state)))
         # The grid knows where the sensor may be; beside it the base may stand in a wall.
         stands = is_free(self.tables.grid, poses)
         return share + jnp.where(stands, self.proposal.log_prior(prepared, poses), -jnp.inf)

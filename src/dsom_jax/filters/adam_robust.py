@@ -147,14 +147,14 @@ class AdamRobust:
         rank = jnp.maximum(jnp.cumsum(~low) - 1, 0)
         ancestors = pick(jnp.cumsum(jnp.exp(log_r)), (rank + jax.random.uniform(k_resample)) / count)
         poses = self.motion.sample(k_move, state.poses[ancestors], inputs.odometry)
-        return Draw(poses, self._log_kept() + (state.log_weights - log_r)[ancestors] - jnp.log(count))
+        return Draw(poses, self._log_kept(state) + (state.log_weights - log_r)[ancestors] - jnp.log(count))
 
     def _redraw(self, key: Key, state: RobustState, low: Array, prepared: Any) -> Draw:
         """L: draw from q."""
         poses, log_q = self.proposal.sample(key, prepared, self.config.particles)
         return Draw(poses, self._log_redrawn(state, poses, prepared) - log_q - jnp.log(low.sum()))
 
-    def _log_kept(self) -> Array:
+    def _log_kept(self, state: RobustState) -> Array:
         """Share of the prior that H stands for: log(1 - eps)."""
         return jnp.log1p(-self.config.kidnap)
 

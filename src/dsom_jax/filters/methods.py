@@ -76,7 +76,9 @@ class Settings:
         hybrid: weights of likelihood grid and network.
         robust, robust_motion, robust_raycast: AdaM robust; its ``particles`` are those above.
         memory: AdaM robust with the likelihood grid as proposal remembers earlier scans on the grid.
-        memory_share: weight of what that memory says, beside the particles' own past.
+        memory_share: least and greatest weight of what that memory says, beside the particles' own past.
+        memory_temper: factor on a scan's log-likelihood in that memory, in place of the grid's own: where the map is
+            wrong, scans taken one after another err alike.
         markov: how that memory moves.
     """
 
@@ -94,15 +96,16 @@ class Settings:
     robust_motion: Motion = OdometryMotion(0.01, 0.01, 0.01, 0.01, 0.02, 0.015, slip=0.1, tail=0.4, tail_scale=4.0)
     robust_raycast: RaycastConfig = RaycastConfig("table")
     memory: bool = False
-    memory_share: float = 0.5
+    memory_share: tuple[float, float] = (0.01, 0.5)
+    memory_temper: float = 0.05
     markov: MarkovGridConfig = MarkovGridConfig()
 
     def __post_init__(self) -> None:
         checks.count(self, "particles max_beams")
         checks.count(self, "seed", 0)
         checks.share(self, "t_cut")
-        checks.share(self, "memory_share", excluding="()")
-        checks.positive(self, "sharpness")
+        checks.span(self, "memory_share")
+        checks.positive(self, "sharpness memory_temper")
 
 
 _SCANNED = 1.0
@@ -123,8 +126,7 @@ _FURNISHED = BeamModel(0.45, 0.4, 0.05, 0.1, sigma_hit=0.6)
 DRAWN = replace(
     REAL,
     robust=replace(REAL.robust, model=replace(_FURNISHED, temper=0.1)),
-    grid=replace(REAL.grid, model=replace(_FURNISHED, temper=0.05)),
-    markov=MarkovGridConfig(kidnap=1e-9),
+    grid=replace(REAL.grid, model=replace(_FURNISHED, temper=0.1)),
 )
 """For floor plans: walls elsewhere, furniture that cuts four beams in ten short (``experiments/robust``)."""
 
@@ -197,7 +199,8 @@ def make_filter(
         tables = make_tables(grid, settings.robust_raycast, lidar.range_max)
         parts = (used, step, settings.robust_motion, robust)
         if settings.memory and isinstance(proposal, LikelihoodGrid):
-            return AdamMemory(tables, space, MarkovGrid(proposal, settings.markov), *parts, settings.memory_share)
+            memory = MarkovGrid(proposal.tempered(settings.memory_temper), settings.markov)
+            return AdamMemory(tables, space, memory, *parts, settings.memory_share)
         return AdamRobust(tables, space, proposal, *parts)
     score = replace(settings.score, range_max=lidar.range_max)
     tables = make_tables(grid, settings.raycast, lidar.range_max)

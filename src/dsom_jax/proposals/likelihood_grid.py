@@ -86,6 +86,10 @@ class LikelihoodGrid:
         full = jnp.full((self.free.size, self.config.headings), -jnp.inf).at[self.cells].set(log_mass, mode="drop")
         return pg.from_log(self.pose_grid, full.reshape(self.pose_grid.shape), self.free)
 
+    def tempered(self, temper: float) -> LikelihoodGrid:
+        """The same grid with another factor on its log-likelihood."""
+        return replace(self, config=replace(self.config, model=replace(self.config.model, temper=temper)))
+
     def log_likelihood(self, ranges: Array) -> Array:
         """(C, K) tempered log p(z | x) at the free cells."""
         picked = beam_choice(self.lidar.beams, self.config.beams)

@@ -29,7 +29,7 @@ class MarkovGridConfig:
         slip: probability that the robot stood still, or drove back what the odometry reports as forth.
     """
 
-    kidnap: float = 1e-6
+    kidnap: float = 1e-9
     slip: float = 0.1
 
     def __post_init__(self) -> None:
