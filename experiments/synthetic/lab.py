@@ -22,6 +22,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from dsom_jax import checkpoint, report
+from dsom_jax.compiling import run_options
 from dsom_jax.data.suite import Suite, load_suite
 from dsom_jax.episode import Episode
 from dsom_jax.errors import UserError
@@ -116,6 +117,11 @@ def scaled(config: C, runs: int) -> C:
         if f.name in SCALED
     }
     return replace(config, **changes)  # type: ignore[type-var]
+
+
+def compiled(function: Callable[..., Any]) -> Any:
+    """``function`` under jit, with the options of the Monte-Carlo runs."""
+    return jax.jit(function, compiler_options=run_options())
 
 
 def measured(job: Job, lab: Lab, config: Any) -> dict[str, Any]:

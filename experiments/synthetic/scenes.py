@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -38,7 +38,7 @@ CONTRADICTS = 0.3
 
 
 class Change(NamedTuple):
-    """How the building and the scan differ from the map and the lidar; one number each.
+    """How the building and the scan differ from the map and the lidar; one number each, traced while scans are taken.
 
     Attributes:
         obstacles: unknown boxes and discs of 0.3 to 1 m.
@@ -50,13 +50,13 @@ class Change(NamedTuple):
         short: share of the beams that something returns early.
     """
 
-    obstacles: float = 20
-    gone: float = 0
-    moved: float = 0.0
-    closed: float = 0.0
-    scale: float = 1.0
-    deep: float = 0.0
-    short: float = 0.0
+    obstacles: Any = 20
+    gone: Any = 0
+    moved: Any = 0.0
+    closed: Any = 0.0
+    scale: Any = 1.0
+    deep: Any = 0.0
+    short: Any = 0.0
 
 
 @dataclass(frozen=True)
@@ -146,7 +146,7 @@ def _take(key: Key, shown: OccupancyGrid, world: OccupancyGrid, change: Change, 
     x, y = shift(here[:, 0], here[:, 1])
     there = here.at[:, 0].add(x).at[:, 1].add(y)
     clean, promised = (_cast(grid, poses) for grid, poses in ((seen, here), (shown, there)))
-    noise = LidarNoise(SIGMA, short=change.short)  # type: ignore[arg-type]  # traced
+    noise = LidarNoise(SIGMA, short=change.short)
     ranges = observe(keys[5], (clean + change.deep) * change.scale, PLAIN.lidar, noise)
     wrong = jnp.abs(jnp.minimum(clean, PLAIN.range_max) - jnp.minimum(promised, PLAIN.range_max)) > CONTRADICTS
     return Scans(ranges, shown.from_grid(there), wrong.mean(-1))

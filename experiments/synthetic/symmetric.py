@@ -48,7 +48,7 @@ def images(grid: OccupancyGrid, poses: Array, order: int) -> Array:
     return grid.from_grid(jnp.stack([*turned, wrap_angle(local[..., 2] + turn)], axis=-1))
 
 
-def off_middle(grid: OccupancyGrid, metres: float) -> Array:
+def off_middle(grid: OccupancyGrid, metres: Array | float) -> Array:
     """(H, W) bool, cells at least ``metres`` from the middle: nearer ones and their images are one place."""
     i, j = jnp.indices(grid.shape)
     away = jnp.hypot(i - (grid.shape[0] - 1) / 2, j - (grid.shape[1] - 1) / 2) * grid.resolution
