@@ -168,8 +168,9 @@ def section(everything: Everything) -> str:
 
 
 UPDATES = """\
-One update of one run with 200 particles, medians by the clock. The scan: PM for DSOM, the encoding of the scan for PF-Net
-and PFRNN. The paper's times are those of one inference on a TITAN GPU, ours of a processor, and its networks are larger."""
+One update of one run with 200 particles, medians by the clock. The scan: PM for DSOM, the encoding of the scan for
+PF-Net and PFRNN. The paper's times are those of one inference on a TITAN GPU, ours of a processor, and its networks are
+larger."""
 
 SIZES = """\
 DSOM on a test map laid side by side. Memory is XLA's own account of arguments (weights and features of the map), result

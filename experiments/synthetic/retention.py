@@ -27,6 +27,8 @@ from dsom_jax.run_table import RunTable, join, run_rows
 from dsom_jax.training import quality
 
 NAME = "retention"
+DSOM = "adam_dsom"
+"""Of Table I."""
 
 
 @dataclass(frozen=True)
@@ -95,12 +97,13 @@ UNITS = {"e_pos_m": ("e_pos", "mean final $E_{pos}$ [m]"), "e_theta_rad": ("e_th
 
 def figures(everything: Everything) -> dict[str, Figure]:
     """Table I as curves; retention by T_cut and proposal."""
-    return {"t_cut": errors_by_t_cut(everything), "retention": kept_by_t_cut(everything)}
+    drawn = {"retention": kept_by_t_cut(everything)}
+    return drawn | ({"t_cut": errors_by_t_cut(everything)} if DSOM in everything[NAME] else {})
 
 
 def errors_by_t_cut(everything: Everything) -> Figure:
     """Errors of converged runs, ours and the paper's."""
-    found = everything[NAME]["adam_dsom"]["by_t_cut"]
+    found = everything[NAME][DSOM]["by_t_cut"]
     figure, grid = panels(2)
     for axes, (key, (which, label)) in zip(grid, UNITS.items(), strict=True):
         for ax, (phase, title) in zip(axes, PHASES.items(), strict=True):
@@ -157,7 +160,8 @@ def _finish(ax: Axes) -> None:
 
 def section(everything: Everything) -> str:
     """Table I, retention and causes of departures."""
-    return "\n\n".join([TABLE_1, t_cut_table(everything), "![Errors by T_cut](FIGURES/t_cut.png)", RETENTION,
+    first = [TABLE_1, t_cut_table(everything), "![Errors by T_cut](FIGURES/t_cut.png)"]
+    return "\n\n".join([*(first if DSOM in everything[NAME] else []), RETENTION,
                         departure_table(everything), "![Retention by T_cut](FIGURES/retention.png)"])  # fmt: skip
 
 
@@ -167,7 +171,7 @@ def t_cut_table(everything: Everything) -> str:
     for phase in ("global", "kidnapping"):
         head += [f"E_pos m, {phase}", "paper", f"E_theta rad, {phase}", "paper", "converged %", "kept %"]
     lines = []
-    for cut, entry in everything[NAME]["adam_dsom"]["by_t_cut"].items():
+    for cut, entry in everything[NAME][DSOM]["by_t_cut"].items():
         line = [cut]
         theirs = paper.T_CUT.get(float(cut))
         for phase, m in entry["summary"].items():

@@ -1,14 +1,14 @@
 """The synthetic report: ``python experiments/synthetic/run.py [--only comparison ...] [--runs 100] [--force]``.
 
-From the networks in ``checkpoints``, on two cores in about 40 minutes. Every job writes ``results/PIECE.JOB.json``; what
-exists is kept, so that an interrupted run continues where it was. Figures (PNG and PDF) and ``experiments/REPORT.md`` are
-made from these files at the end.
+From the networks in ``checkpoints``, on two cores in about 40 minutes. Every job writes
+``results/PIECE.JOB.json``; what exists is kept, so that an interrupted run continues where it was. Figures (PNG and
+PDF) and ``experiments/REPORT.md`` are made from these files at the end.
 """
 
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import comparison
@@ -83,7 +83,8 @@ def run_piece(piece: Piece, lab: Lab, args: Args, folder: Path) -> None:
         if args.only and not {piece.name, full} & set(args.only):
             continue
         if path.exists() and not args.force:
-            print(f"{full}: kept", flush=True)
+            same = read(path)["made"]["config"] == report.plain(asdict(config))
+            print(f"{full}: kept" + ("" if same else ", made with other settings (--force)"), flush=True)
             continue
         data = measured(job, lab, config)
         write(path, data)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import verdicts
-from lab import Everything, Piece, read
+from lab import Everything, Piece, Results, read
 from tables import markdown, number
 
 from dsom_jax import plotting
@@ -66,7 +66,7 @@ def render(pieces: Sequence[Piece], everything: Everything) -> str:
     return "\n\n".join(blocks) + "\n"
 
 
-def made_with(jobs: dict[str, Any]) -> str:
+def made_with(jobs: Results) -> str:
     """The configuration of a piece, in one line; what differs between its jobs is given as all values."""
     configs = [entry["made"]["config"] for entry in jobs.values()]
     parts = []
