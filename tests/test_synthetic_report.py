@@ -1,4 +1,4 @@
-"""The synthetic report: its symmetric buildings, its side-by-side runs, its verdicts, and its page from made results."""
+"""The synthetic report: symmetric buildings, side-by-side runs, departures, verdicts, the page from made results."""
 
 from __future__ import annotations
 
@@ -49,7 +49,8 @@ def test_all_images_of_a_pose_see_the_same(order):
     grid = symmetric.symmetric(random_map(), order)
     turned = [np.rot90(np.asarray(grid.occupied), quarter) for quarter in range(0, 4, 4 // order)]
     assert all((cells == turned[0]).all() for cells in turned)
-    assert order == 1 or not (np.rot90(turned[0], 4 // order // 2 or 1) == turned[0]).all() or order == 4
+    if order == 2:
+        assert (np.rot90(turned[0]) != turned[0]).any()
     local = jnp.array([[2.3, 3.1, 0.4], [6.2, 1.7, -2.9]])
     poses = symmetric.images(grid, grid.from_grid(local), order)
     assert poses.shape == (2, order, 3)
@@ -148,13 +149,13 @@ def made_runs(seed: int, steps: int, error: float, count: int = 20) -> Runs:
 def made_results(better: str) -> dict[str, Any]:
     """Results of the comparison in which ``better`` is best in everything and the others are equal."""
     results: dict[str, Any] = {}
-    for name in comparison.METHODS:
+    for name in comparison.COMPARED:
         steps, error = (3, 0.05) if name == better else (30, 1.0)
         parts = {phase: [made_runs(n, steps, error) for n in range(6)] for phase in comparison.PHASES}
         rows = [run_rows(name, phase, n, 0, r) for phase, runs in parts.items() for n, r in enumerate(runs)]
         entry = {phase: summarize(pool(runs)) for phase, runs in parts.items()} | {"ms_per_step": 1.0}
         band = {"mean": [20.0, error], "low": [19.0, error], "high": [21.0, error]}
-        config = {"runs": 20, "methods": list(comparison.METHODS)}
+        config = {"runs": 20, "methods": list(comparison.COMPARED)}
         results[name] = {"made": made(config), "summary": entry, "runs": kept_runs.rows(join(rows)),
                          "evolution": [band] * 6, "kidnapped": [[1]] * 6}  # fmt: skip
     return results
@@ -166,20 +167,22 @@ def made(config: dict[str, Any]) -> dict[str, Any]:
             "processor_s": 2.0}  # fmt: skip
 
 
-@pytest.fixture(scope="module", params=["adam_dsom", "pfrnn"])
-def results(request, tmp_path_factory) -> tuple[str, Path]:
-    folder = tmp_path_factory.mktemp("results")
-    for name, entry in made_results(request.param).items():
-        lab.write(folder / f"comparison.{name}.json", entry)
-    return request.param, folder
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory) -> dict[str, Path]:
+    """Folders of results in which one method or another is the best."""
+    made_folders = {better: tmp_path_factory.mktemp(better) for better in ("adam_dsom", "pfrnn")}
+    for better, folder in made_folders.items():
+        for name, entry in made_results(better).items():
+            lab.write(folder / f"comparison.{name}.json", entry)
+    return made_folders
 
 
-def test_verdicts_follow_the_runs(results):
+@pytest.mark.parametrize("better", ["adam_dsom", "pfrnn"])
+def test_verdicts_follow_the_runs(folders, better):
     import run as script
     import write_report
 
-    better, folder = results
-    found = {v.claim: v for v in verdicts.verdicts(write_report.gather(script.PIECES, folder))}
+    found = {v.claim: v for v in verdicts.verdicts(write_report.gather(script.PIECES, folders[better]))}
     (accuracy,) = (v for claim, v in found.items() if "more accurately" in claim)
     (early,) = (v for claim, v in found.items() if "fewer steps" in claim)
     assert accuracy.outcome == early.outcome == ("holds" if better == "adam_dsom" else "does not hold here")
@@ -188,19 +191,18 @@ def test_verdicts_follow_the_runs(results):
     assert not any("Table" in claim or "quicker" in claim or "peaks" in claim for claim in found)
 
 
-def test_the_page_is_made_from_results(results, tmp_path):
+def test_the_page_is_made_from_results(folders, tmp_path):
     import run as script
     import write_report
 
-    _, folder = results
     page = tmp_path / "REPORT.md"
-    write_report.write(script.PIECES, folder, tmp_path / "figures", page)
+    write_report.write(script.PIECES, folders["adam_dsom"], tmp_path / "figures", page)
     text = page.read_text()
     links = re.findall(r"!\[[^\]]*\]\(([^)]+)\)", text)
     assert len(links) == 8 and all((tmp_path / link).stat().st_size > 5000 for link in links)
     assert all((tmp_path / link).with_suffix(".pdf").is_file() for link in links)
-    assert "`adam_dsom`" in text and "does not hold here" in text or "holds" in text
-    assert "FIGURES" not in text and "nan" not in text.lower().replace("finan", "")
+    assert "`adam_dsom`" in text and "holds" in text
+    assert "FIGURES" not in text and "nan" not in text.lower()
 
 
 def test_numbers_survive_the_file(tmp_path):

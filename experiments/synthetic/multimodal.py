@@ -218,7 +218,8 @@ def section(everything: Everything) -> str:
                           percent(m["right"]), percent(m["truth"]), percent(m["least"])])  # fmt: skip
     head = ("right poses", "proposal", "peaks, mean", "exactly so many %", "all found %", "PM at right poses %",
             "at the true one %", "at the least likely one %")  # fmt: skip
-    return "\n\n".join([SCENES, SYMMETRIC, markdown(head, lines), "![Symmetric](FIGURES/symmetric.png)"])
+    orders = [SYMMETRIC, markdown(head, lines), "![Symmetric](FIGURES/symmetric.png)"]
+    return "\n\n".join([*([SCENES] if "scenes" in results else []), *(orders if lines else [])])
 
 
 SCENES = """\
