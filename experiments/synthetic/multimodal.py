@@ -40,7 +40,7 @@ class Config:
     """Attributes: every so many-th scan of the test sequences is judged; symmetric buildings of each order; scans in
     each; orders; least distance from the middle of a symmetric building, metres."""
 
-    every: int = 4
+    every: int = 8
     worlds: int = 8
     scans: int = 12
     orders: tuple[int, ...] = (1, 2, 4)
