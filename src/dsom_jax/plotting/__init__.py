@@ -3,13 +3,23 @@
 Every function returns a matplotlib ``Figure`` that no window system knows of; :func:`save` writes it as PNG or PDF.
 """
 
-from dsom_jax.plotting.charts import benchmark_figures, calibration_curves, error_boxes, error_evolution, step_bars
+from dsom_jax.plotting.charts import (
+    band_evolution,
+    benchmark_figures,
+    calibration_curves,
+    confidence_band,
+    error_boxes,
+    error_evolution,
+    step_bars,
+)
 from dsom_jax.plotting.common import save
 from dsom_jax.plotting.maps import map_view, map_views, moment_figure
 
 __all__ = [
+    "band_evolution",
     "benchmark_figures",
     "calibration_curves",
+    "confidence_band",
     "error_boxes",
     "error_evolution",
     "map_view",

@@ -34,12 +34,19 @@ _FLIERS = {"marker": ".", "markersize": 2.5, "markerfacecolor": "0.3", "markered
 _MEANS = {"marker": "D", "markersize": 4, "markerfacecolor": "white", "markeredgecolor": "black"}
 
 
-def error_boxes(errors: Mapping[str, Mapping[str, np.ndarray]]) -> Figure:
-    """Final E_pos (metres) of all runs, one panel per phase, one box per method: {phase: {method: (N,)}}."""
+def error_boxes(
+    errors: Mapping[str, Mapping[str, np.ndarray]],
+    label: str = "final position error $E_{pos}$ [m]",
+    floor: float = FLOOR,
+) -> Figure:
+    """Final errors of all runs, one panel per phase, one box per method: {phase: {method: (N,)}}.
+
+    ``label`` names the error and its unit; what is below ``floor`` is drawn there.
+    """
     widest = max(len(methods) for methods in errors.values())
     figure, axes = panels(len(errors), 1 + 0.7 * widest, 4.0, sharey=True)
     for ax, (phase, methods) in zip(axes, errors.items(), strict=True):
-        drawn = [np.clip(e[np.isfinite(e)], FLOOR, None) for e in methods.values()]
+        drawn = [np.clip(e[np.isfinite(e)], floor, None) for e in methods.values()]
         boxes = ax.boxplot(drawn, widths=0.6, patch_artist=True, showmeans=True, flierprops=_FLIERS,
                            meanprops=_MEANS, medianprops={"color": "black"})  # fmt: skip
         for box, name in zip(boxes["boxes"], methods, strict=True):
@@ -47,7 +54,7 @@ def error_boxes(errors: Mapping[str, Mapping[str, np.ndarray]]) -> Figure:
         ax.set(title=_phase_title(phase), yscale="log")
         ax.set_xticks(range(1, len(methods) + 1), [_label(name) for name in methods], rotation=35, ha="right")
         _metre_ticks(ax)
-    axes[0].set_ylabel("final position error $E_{pos}$ [m]")
+    axes[0].set_ylabel(label)
     figure.supxlabel("line: median, diamond: mean, whiskers: 1.5 IQR; all runs", fontsize=8, color="0.4")
     return figure
 
@@ -74,23 +81,37 @@ def step_bars(histograms: Mapping[str, Mapping[str, Mapping[str, int]]]) -> Figu
     return figure
 
 
+Band = Mapping[str, Any]
+"""``mean``, ``low`` and ``high`` (T,) of an error over the updates, NaN where the truth is unknown."""
+
+
 def error_evolution(traces: Sequence[Mapping[str, np.ndarray]], kidnapped: Sequence[Any]) -> Figure:
     """Mean E_pos (metres) over the updates with its 95 % band: per episode {method: (R, T)} and kidnap flags (T,)."""
-    columns = min(3, len(traces))
-    rows = -(-len(traces) // columns)
+    bands = [
+        {name: dict(zip(("mean", "low", "high"), confidence_band(errors), strict=True)) for name, errors in by.items()}
+        for by in traces
+    ]
+    return band_evolution(bands, [np.flatnonzero(np.asarray(moved)).tolist() for moved in kidnapped])
+
+
+def band_evolution(bands: Sequence[Mapping[str, Band]], kidnapped: Sequence[Sequence[int]]) -> Figure:
+    """As :func:`error_evolution`, from bands and the updates at which the robot was carried away."""
+    columns = min(3, len(bands))
+    rows = -(-len(bands) // columns)
     figure = Figure(figsize=(4.2 * columns, 2.7 * rows + 0.6), layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False, sharey=True)
-    for ax, methods, moved, number in zip(grid.flat, traces, kidnapped, range(len(traces)), strict=False):
-        for name, errors in methods.items():
-            _band(ax, errors, _color(name), _label(name))
-        for t in np.flatnonzero(np.asarray(moved)):
+    for ax, methods, moved, number in zip(grid.flat, bands, kidnapped, range(len(bands)), strict=False):
+        for name, band in methods.items():
+            _band(ax, band, _color(name), _label(name))
+        for t in moved:
             ax.axvline(t, color="black", linestyle=":", linewidth=1, label="kidnapped")
         ax.axhline(2.0, color="0.5", linewidth=0.8, linestyle="--")
-        ax.set(yscale="log", xlabel="update", title=f"sequence {number + 1}", xlim=(0, len(np.asarray(moved)) - 1))
+        last = max((len(band["mean"]) for band in methods.values()), default=1) - 1
+        ax.set(yscale="log", xlabel="update", title=f"sequence {number + 1}", xlim=(0, last))
         _metre_ticks(ax)
     for ax in grid[:, 0]:
         ax.set_ylabel("mean $E_{pos}$ [m]")
-    for ax in list(grid.flat)[len(traces) :]:
+    for ax in list(grid.flat)[len(bands) :]:
         ax.set_axis_off()
     named = {label: handle for ax in grid.flat for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
     legend(figure, list(named.values()), list(named), columns=min(6, len(named)))
@@ -122,17 +143,26 @@ def calibration_curves(curves: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> F
     return figure
 
 
-def _band(ax: Axes, errors: np.ndarray, color: str, label: str) -> None:
-    """Mean over runs (R, T) and its bootstrap 95 % interval, where the reference is known."""
+def confidence_band(errors: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mean over runs (R, T) and its bootstrap 95 % interval, (T,) each; NaN where the reference is unknown."""
     time = np.flatnonzero(~np.isnan(errors).all(0))
-    errors = errors[:, time]
+    known = errors[:, time]
     # An estimate that is no number is drawn as the worst error that was seen.
-    errors = np.where(np.isfinite(errors), errors, np.max(errors, initial=0.0, where=np.isfinite(errors)))
-    runs = len(errors)
+    known = np.where(np.isfinite(known), known, np.max(known, initial=0.0, where=np.isfinite(known)))
+    runs = len(known)
     draws = np.random.default_rng(0).multinomial(runs, np.full(runs, 1 / runs), size=500)
-    low, high = np.percentile(draws @ errors / runs, [2.5, 97.5], axis=0)
-    ax.plot(time, np.maximum(errors.mean(0), FLOOR), color=color, linewidth=1.4, label=label)
-    ax.fill_between(time, np.maximum(low, FLOOR), np.maximum(high, FLOOR), color=color, alpha=0.2, linewidth=0)
+    filled = np.full((3, errors.shape[1]), np.nan)
+    filled[:, time] = known.mean(0), *np.percentile(draws @ known / runs, [2.5, 97.5], axis=0)
+    return filled[0], filled[1], filled[2]
+
+
+def _band(ax: Axes, band: Band, color: str, label: str) -> None:
+    """The mean and its band, where the reference is known."""
+    mean, low, high = (np.array(band[name], float) for name in ("mean", "low", "high"))
+    time = np.flatnonzero(~np.isnan(mean))
+    mean, low, high = (np.maximum(values[time], FLOOR) for values in (mean, low, high))
+    ax.plot(time, mean, color=color, linewidth=1.4, label=label)
+    ax.fill_between(time, low, high, color=color, alpha=0.2, linewidth=0)
 
 
 def _write_shares(ax: Axes, left: np.ndarray, share: np.ndarray) -> None:

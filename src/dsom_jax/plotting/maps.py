@@ -57,7 +57,7 @@ def map_view(
 
 def map_views(views: Sequence[Mapping[str, Any]], titles: Sequence[str]) -> Figure:
     """Moments side by side: the arguments of :func:`map_view` after ``ax``, and a title each."""
-    figure, axes = panels(len(views), 4.4, 4.9, sharey=True)
+    figure, axes = panels(len(views), 4.4, 5.5, sharey=True)
     for ax, view, title in zip(axes, views, titles, strict=True):
         map_view(ax, **view)
         ax.set_title(title)

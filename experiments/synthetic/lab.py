@@ -1,0 +1,184 @@
+"""What the experiments share: the suite, the networks, settings, and what one experiment (a piece) consists of.
+
+A piece has jobs. A job computes numbers and nothing else, and they are kept as ``results/PIECE.JOB.json``; figures
+and the section of the report are made from what is kept, so that they can be drawn again without running anything.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import platform
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, fields, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import jax
+import numpy as np
+from matplotlib.figure import Figure
+
+from dsom_jax import checkpoint, report
+from dsom_jax.compiling import run_options
+from dsom_jax.data.suite import Suite, load_suite
+from dsom_jax.episode import Episode
+from dsom_jax.errors import UserError
+from dsom_jax.filters.methods import build_filter, network_of
+from dsom_jax.montecarlo import run_keys
+from dsom_jax.occupancy import OccupancyGrid
+from dsom_jax.run_folder import commit
+from dsom_jax.types import Filter, Key, Proposal
+
+C = TypeVar("C")
+SCALED = ("runs", "worlds", "repeats")
+"""Fields of configurations that ``--runs`` scales, in proportion to 100."""
+DIGITS = 6
+"""Significant digits that are kept of every number."""
+
+Results = Mapping[str, dict[str, Any]]
+"""What the jobs of one piece gave, by job."""
+Everything = Mapping[str, Results]
+"""The results of all pieces, by piece."""
+
+
+@dataclass
+class Lab:
+    """The suite and the shipped networks, loaded when they are first needed.
+
+    Attributes:
+        seed: of all randomness.
+        sources: proposals that were made, by the name of the map.
+    """
+
+    seed: int = 0
+    sources: dict[str, dict[str, Proposal]] = field(default_factory=dict)
+
+    @cached_property
+    def suite(self) -> Suite:
+        """synthetic-v1: six drives through two buildings that no training saw, one kidnapping each."""
+        return load_suite("synthetic-v1")
+
+    @cached_property
+    def networks(self) -> dict[str, Any]:
+        """The shipped networks by kind."""
+        found = {}
+        for kind in ("dsom", "pf_net", "pfrnn"):
+            folder = checkpoint.shipped(kind)
+            if folder is None:
+                raise UserError(f"checkpoints/{kind.replace('_', '-')}: not there; run this from the repository")
+            found[kind] = checkpoint.load(folder, self.suite.lidar, kind=kind)
+        return found
+
+    def keys(self, runs: int) -> list[Key]:
+        """Keys of the runs of each sequence: the same for all methods and settings."""
+        return [run_keys(self.seed, number, runs) for number in range(len(self.suite.episodes))]
+
+    def build(
+        self, name: str, where: str, grid: OccupancyGrid, episode: Episode, particles: int = 200, t_cut: float = 0.6
+    ) -> Filter:
+        """Filter of a method of :data:`dsom_jax.filters.methods.METHODS` on the map called ``where``."""
+        network = self.networks.get(network_of(name) or "")
+        made = self.sources.setdefault(where, {})
+        own: dict[str, Any] = {"particles": particles, "t_cut": t_cut, "episode": episode}
+        return jax.block_until_ready(
+            build_filter(name, grid, self.suite.lidar, **own, checkpoint=network, sources=made)
+        )
+
+
+Job = Callable[[Lab], dict[str, Any]]
+
+
+class Piece(NamedTuple):
+    """One experiment.
+
+    Attributes:
+        name: prefix of its results.
+        config: a frozen dataclass; what the jobs depend on.
+        jobs: name -> what computes it, from the configuration.
+        figures: by name, from the results of all pieces.
+        section: markdown, from the results of all pieces.
+    """
+
+    name: str
+    config: Any
+    jobs: Callable[[Any], dict[str, Job]]
+    figures: Callable[[Everything], dict[str, Figure]]
+    section: Callable[[Everything], str]
+
+
+def scaled(config: C, runs: int) -> C:
+    """The configuration with its numbers of runs, worlds and repeats in the proportion ``runs`` : 100, at least 1."""
+    changes = {
+        f.name: max(1, math.ceil(getattr(config, f.name) * runs / 100))
+        for f in fields(config)  # type: ignore[arg-type]
+        if f.name in SCALED
+    }
+    return replace(config, **changes)  # type: ignore[type-var]
+
+
+def compiled(function: Callable[..., Any]) -> Any:
+    """``function`` under jit, with the options of the Monte-Carlo runs."""
+    return jax.jit(function, compiler_options=run_options())
+
+
+def measured(job: Job, lab: Lab, config: Any) -> dict[str, Any]:
+    """The numbers of a job, with its configuration, when, where and in what time it was made."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    data = job(lab)
+    made = {
+        "config": asdict(config),
+        "seed": lab.seed,
+        "commit": commit(),
+        "machine": machine(),
+        "wall_s": time.perf_counter() - wall,
+        "processor_s": time.process_time() - cpu,
+    }
+    return {"made": made, **data}
+
+
+def machine() -> dict[str, Any]:
+    """Where numbers were taken, and how busy it was."""
+    processor = next((line.split(":")[1].strip() for line in _cpuinfo() if line.startswith("model name")), "")
+    return {
+        "processor": processor or platform.processor() or platform.machine(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "load": os.getloadavg()[0],
+        "device": f"{jax.device_count()} x {jax.devices()[0].device_kind}",
+        "jax": jax.__version__,
+        "python": platform.python_version(),
+    }
+
+
+def _cpuinfo() -> list[str]:
+    try:
+        return Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return []
+
+
+def write(path: Path, data: dict[str, Any]) -> None:
+    """Strict JSON on as few lines as can be read, with :data:`DIGITS` digits; NaN and infinities become null."""
+    rows = [f" {json.dumps(key)}: {json.dumps(_rounded(report.plain(data[key])), allow_nan=False)}" for key in data]
+    report.write_text(path, "{\n" + ",\n".join(rows) + "\n}\n")
+
+
+def read(path: Path) -> dict[str, Any]:
+    """What :func:`write` wrote."""
+    found: dict[str, Any] = json.loads(path.read_text())
+    return found
+
+
+def _rounded(data: Any) -> Any:
+    if isinstance(data, dict):
+        return {key: _rounded(value) for key, value in data.items()}
+    if isinstance(data, list):
+        return [_rounded(value) for value in data]
+    return float(f"{data:.{DIGITS}g}") if isinstance(data, float) else data
+
+
+def column(values: Any) -> np.ndarray:
+    """A list of numbers of a results file as an array; null is NaN."""
+    return np.array([math.nan if v is None else v for v in values], float)
