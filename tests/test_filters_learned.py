@@ -16,12 +16,10 @@ from dsom_jax.filters.methods import LEARNED, METHODS, STANDARD, build_filter, n
 from dsom_jax.geometry import compose, relative, wrap_angle
 from dsom_jax.nn.view_net import ScanCode
 from dsom_jax.occupancy import is_free
-from learned_kit import KINDS, MODELS, PFRNN, VIEW, make, quick_compilation
+from learned_kit import KINDS, MODELS, PFRNN, VIEW, make
 
 TRUTH = tiny_world.drive().poses[0]
-PRIOR = Prior(TRUTH, jnp.array([0.3, 0.3, 0.17]))
-
-quick = pytest.fixture(quick_compilation)
+PRIOR = Prior(TRUTH, jnp.array([0.4, 0.15, 0.17]))
 
 
 @pytest.fixture(scope="module")
@@ -33,14 +31,14 @@ def inputs_at(episode, t):
     return jax.tree.map(lambda leaf: leaf[t], episode.inputs)
 
 
-def test_motion_without_noise_is_exact(quick):
+def test_motion_without_noise_is_exact():
     poses = jax.random.uniform(jax.random.key(0), (50, 3), minval=-3, maxval=3)
     odometry = jnp.array([0.4, -0.1, 0.3])
     moved = MODELS["pf_net"].move(poses, odometry, jnp.zeros((50, 3)))
     np.testing.assert_array_equal(moved, compose(poses, odometry))
 
 
-def test_motion_noise_is_in_the_base_frame_and_never_below_its_floor(quick):
+def test_motion_noise_is_in_the_base_frame_and_never_below_its_floor():
     model, odometry = MODELS["pf_net"], jnp.array([0.4, -0.1, 0.3])
     noise = jax.random.normal(jax.random.key(0), (20, 3))
     pose = jnp.array([5.0, 2.0, 2.2])
@@ -70,7 +68,7 @@ def test_cell_is_a_gru_with_a_drawn_candidate():
     np.testing.assert_allclose(log_likelihood, likelihood, atol=1e-5)
 
 
-def test_corrections_are_bounded_and_in_the_particles_frame(quick):
+def test_corrections_are_bounded_and_in_the_particles_frame():
     poses = jnp.array([[1.0, 2.0, 3.0], [0.0, 0.0, -1.0]])
     wild = 1e3 * jax.random.normal(jax.random.key(0), (2, PFRNN.hidden))
     step = np.abs(relative(poses, MODELS["pfrnn"].correct(poses, wild)))
@@ -96,7 +94,7 @@ def test_observation_network_by_hand():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_start_anywhere_or_from_a_prior(quick, kind):
+def test_start_anywhere_or_from_a_prior(kind):
     lost = jax.jit(lambda f, key: f.init(key))(make(kind, 500), jax.random.key(0))
     assert is_free(tiny_world.grid(), lost.poses).all()
     assert np.asarray(lost.poses[:, :2]).std(0).min() > 0.8
@@ -110,7 +108,7 @@ def test_start_anywhere_or_from_a_prior(quick, kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_update(quick, kind, episode):
+def test_update(kind, episode):
     chex.clear_trace_counter()
     filter = make(kind, 24, PRIOR)
     step = jax.jit(chex.assert_max_traces(lambda f, key, state, now: f.step(key, state, now, f.prepare(now)), n=1))
@@ -127,7 +125,7 @@ def test_update(quick, kind, episode):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_run_of_100_is_the_run_alone_bit_for_bit(kind, episode):
+def test_a_run_of_100_is_the_run_alone_bit_for_bit(kind, episode, optimised):
     keys = montecarlo.run_keys(0, 0, 100)
     whole = montecarlo.run(make(kind), episode, keys)
     for alone in (17, 99):

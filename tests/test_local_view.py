@@ -23,12 +23,10 @@ from dsom_jax.nn.local_view import (
     scan_view,
 )
 from dsom_jax.occupancy import from_cells
-from learned_kit import quick_compilation
 from reference.local_view import crop
 
 draw = jax.jit(scan_view, static_argnums=(1, 2))
 look = jax.jit(local_view, static_argnums=2)
-quick = pytest.fixture(scope="module", autouse=True)(quick_compilation)
 VIEW = ViewConfig(cells=16, resolution=0.3, map_resolution=0.25, beams=32, reach_min=5.0)
 
 

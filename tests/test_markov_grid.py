@@ -157,7 +157,7 @@ def test_the_first_update_is_that_of_adam_robust(filters):
     np.testing.assert_allclose(with_memory.state.log_weights, without.state.log_weights, atol=2e-3)
 
 
-def test_it_finds_the_robot_keeps_it_and_run_r_is_the_run_alone(filters):
+def test_it_finds_the_robot_keeps_it_and_run_r_is_the_run_alone(filters, optimised):
     episode = tiny_world.drive()
     keys = run_keys(3, 0, 6)
     info = run(filters[0], episode, keys).info

@@ -32,9 +32,8 @@ from dsom_jax.training.filter_loop import (
 )
 from dsom_jax.training.filter_loss import huber, particle_loss, prediction_loss
 from dsom_jax.training.sequences import Window, make_windows, path_distance, plan_paths, spoil_world
-from learned_kit import DATA, KINDS, MODELS, PF_NET, quick_compilation, training
+from learned_kit import DATA, KINDS, MODELS, PF_NET, training
 
-quick = pytest.fixture(scope="module", autouse=True)(quick_compilation)
 GRID = replace(tiny_world.grid(), origin=jnp.zeros(3))
 
 
