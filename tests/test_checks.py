@@ -64,7 +64,9 @@ def test_choices_and_sums():
     assert passes(checks.choice, "fast", allowed=("fast", "exact")) and not passes(
         checks.choice, "slow", allowed=("fast",)
     )
-    assert passes(checks.sum_to_one, 0.25, 0.75, names="a b") and not passes(checks.sum_to_one, 0.25, 0.751, names="a b")
+    assert passes(checks.sum_to_one, 0.25, 0.75, names="a b") and not passes(
+        checks.sum_to_one, 0.25, 0.751, names="a b"
+    )
 
 
 @pytest.mark.parametrize("check", [checks.positive, checks.count])

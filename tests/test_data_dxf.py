@@ -89,17 +89,66 @@ def test_a_room_in_metres(tmp_path):
 
 @pytest.mark.parametrize(
     ("code", "units", "factor"),
-    [(4, "", 0.001), (5, "", 0.01), (6, "", 1.0), (2, "", 0.3048), (1, "", 0.0254), (0, "m", 1.0), (4, "m", 1.0)],
+    [
+        (4, "", 0.001),
+        (5, "", 0.01),
+        (14, "", 0.1),
+        (6, "", 1.0),
+        (7, "", 1000.0),
+        (2, "", 0.3048),
+        (1, "", 0.0254),
+        (10, "", 0.9144),
+        (0, "m", 1.0),
+        (4, "m", 1.0),
+    ],
 )
 def test_units_of_the_drawing_or_as_told(tmp_path, code, units, factor):
     path = write(tmp_path / "plan.dxf", lambda m: room(m, [(x / factor, y / factor) for x, y in ROOM]), units=code)
     grid = load_drawing(path, Drawing(resolution=0.25, units=units))
     assert int(grid.free.sum()) == 23 * 15 and free_at(grid, (0.2, 0.2), (5.8, 3.8)) == [True, True]
+    # The place to start from is in the drawing's unit, too.
+    started = load_drawing(path, Drawing(resolution=0.25, units=units, start=(5 / factor, 1 / factor)))
+    assert int(started.free.sum()) == 23 * 15
 
 
 def on_circle(centre, radius, degrees):
     angles = np.radians(degrees)
     return np.c_[centre[0] + radius * np.cos(angles), centre[1] + radius * np.sin(angles)]
+
+
+@pytest.mark.parametrize("factor", [0.001, 1.0, 1000.0])
+def test_curves_are_round_whatever_the_unit(tmp_path, factor):
+    units = {0.001: "mm", 1.0: "m", 1000.0: "km"}[factor]
+    path = write(tmp_path / "plan.dxf", lambda m: m.add_circle((0, 0), 9 / factor))
+    grid = load_drawing(path, Drawing(resolution=0.1, units=units))
+    i, j = np.nonzero(np.asarray(grid.occupied))
+    local = (np.stack([j, i, 0 * i], -1) + 0.5) * 0.1
+    reach = np.hypot(*np.asarray(grid.from_grid(jnp.asarray(local, jnp.float32)))[:, :2].T)
+    # Half a diagonal of a cell, and the 3e-4 of a Bezier arc, and a tenth of a cell for flat pieces.
+    assert np.abs(reach - 9).max() < 0.1 * math.sqrt(0.5) + 9 * 3e-4 + 0.01
+
+
+def test_filled_shapes_and_double_lines_are_drawn_by_their_edges(tmp_path):
+    def draw(msp):
+        room(msp, [(-10, -10), (10, -10), (10, 10), (-10, 10)])
+        # The corners of SOLID and TRACE come in the order of a Z.
+        msp.add_solid([(-8, -8), (-5, -8), (-8, -5), (-5, -5)])
+        msp.add_trace([(2, -8), (5, -8), (2, -5), (5, -5)])
+        msp.add_3dface([(-8, 2, 0), (-5, 2, 1), (-5, 5, 2), (-8, 5, 1)])
+        msp.add_mline([(2, 2), (8, 2)], dxfattribs={"scale_factor": 2.0, "justification": 1})
+        msp.add_lwpolyline([(2, 7, 0.5), (8, 7, 0.5)], format="xys")
+        msp.add_point((0, 0))
+
+    report = Report()
+    grid = load(tmp_path, draw, report)
+    for x, y in ((-8, -8), (2, -8), (-8, 2)):
+        edges = [(x, y + 1.5), (x + 3, y + 1.5), (x + 1.5, y), (x + 1.5, y + 3)]
+        assert occupied_at(grid, edges).all() and not occupied_at(grid, [(x + 1.5, y + 1.2)]).any()
+    # Two lines two metres apart, one on either side of the way.
+    assert occupied_at(grid, [(5, 1), (5, 3), (5, 7)]).all() and not occupied_at(grid, [(5, 2), (5, 7.3)]).any()
+    assert sorted(report.lines()) == [
+        "1 POINT entities not drawn", "1 polylines with a width, of which the middle line is drawn",
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize("version", ["R12", "R2000", "R2018"])

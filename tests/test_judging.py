@@ -30,7 +30,9 @@ def outcome(late: tuple[int, int], start: float = 100.0, mean_off: float = 1.0, 
     since = np.arange(UPDATES) % MOVED
     off = np.array([np.where((since < first) | (np.arange(UPDATES) >= AGAIN), 3.0, 0.1) for first in late])
     cluster = truth + off[..., None] * [0.0, 1.0, 0.0]
-    info = SimpleNamespace(mean=cluster + np.array([0.0, mean_off, 0.0]), cluster=cluster, lost=np.where(off > 2, 0.01, 0.9))
+    info = SimpleNamespace(
+        mean=cluster + np.array([0.0, mean_off, 0.0]), cluster=cluster, lost=np.where(off > 2, 0.01, 0.9)
+    )
     odometry = np.stack([STEP, np.zeros(UPDATES), np.zeros(UPDATES)], -1)
     odometry[[0, MOVED, AGAIN]] = 0.0
     kidnapped = np.isin(np.arange(UPDATES), [MOVED, AGAIN])

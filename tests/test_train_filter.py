@@ -21,7 +21,7 @@ from dsom_jax.errors import UserError, run_cli
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.nn import create_pf_net
 from dsom_jax.occupancy import OccupancyGrid, is_free
-from dsom_jax.training import filter_evaluation
+from dsom_jax.training import filter_evaluation, filter_loop
 from dsom_jax.training.filter_evaluation import summarise
 from dsom_jax.training.filter_loop import (
     averaged_filter_model,
@@ -129,11 +129,52 @@ def test_training_lowers_the_loss(kind, pool, windows):
     for _ in range(60):
         state, metrics = step(state, windows, jnp.int32(1000))
         losses.append(float(metrics["total"]))
+    # Only PFRNN is paid for the likelihood of its particles.
+    weight = config.particle_weight if kind == "pfrnn" else 0.0
+    assert losses[-1] == pytest.approx(float(metrics["prediction"] + weight * metrics["particles"]), rel=1e-5)
     assert np.mean(losses[-10:]) < 0.8 * np.mean(losses[:10])
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(state))
     changed = [not np.array_equal(a, b) for a, b in zip(first, jax.tree.leaves(state.params), strict=True)]
     assert all(changed), "a weight without gradient"
     assert averaged_filter_model(config, state).config == config.model
+    check_average(step, config, windows)
+
+
+def check_average(step, config, windows):
+    """The first step weighs the fresh weights by a tenth, later ones by up to ``ema``; each step has luck of its own."""
+    first, totals = init_filter_state(config), []
+    for done, decay in ((0, 0.1), (10, 11 / 20), (10**6, config.ema)):
+        before = jax.tree.map(np.array, first.average)
+        state, metrics = step(
+            jax.tree.map(jnp.copy, first._replace(step=jnp.int32(done))), windows, jnp.int32(2 * 10**6)
+        )
+        expected = jax.tree.map(lambda a, b, d=decay: d * a + (1 - d) * np.asarray(b), before, state.params)
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), state.average, expected)
+        totals.append(float(metrics["total"]))
+    assert len(set(totals)) == 3
+
+
+def test_a_sequence_is_followed_on_its_own_map(pool, windows, monkeypatch):
+    class Seen(Exception):
+        pass
+
+    def stop(params, graph, config, place):
+        raise Seen(place)
+
+    monkeypatch.setattr(filter_loop, "make_tracker", stop)
+    two = pool._replace(occupied=jnp.stack([pool.occupied[0], ~pool.occupied[1]]))
+    places, config = stack_maps(two, GRID.resolution), training("pf_net")
+    for where in (0, 1):
+        window = jax.tree.map(lambda leaf: leaf[0], windows)._replace(where=jnp.int32(where))
+        with pytest.raises(Seen) as seen:
+            filter_loop.follow(None, None, config, places, jax.random.key(0), window)
+        np.testing.assert_array_equal(seen.value.args[0].codes, places.codes[where])
+
+
+def test_scans_are_thinned(pool):
+    thin = replace(DATA, beam_step=3)
+    made = jax.eval_shape(lambda key: make_windows(key, pool, thin, GRID.resolution, 4, 12), jax.random.key(0))
+    assert made.ranges.shape == (4, 4, 11)
 
 
 def test_summary_of_tracking():
