@@ -38,6 +38,17 @@ def pytest_unconfigure() -> None:
         shutil.rmtree(OWN_CACHE, ignore_errors=True)
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _small_blocks():
+    """Grids of free cells are filled up to 512 in place of 4096: the rooms of most tests have about 300.
+
+    The tests of the likelihood grid itself take the true number.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("dsom_jax.proposals.likelihood_grid._BLOCK", 512)
+        yield
+
+
 @pytest.fixture(scope="module")
 def optimised():
     """Compilation as users have it: for promises about bits, and for accuracy."""
