@@ -1,8 +1,25 @@
-"""Hypothesis draws the same few examples every time, so that the suite is fast and its verdict repeatable."""
+"""What all tests share: how they compile, and which examples hypothesis draws.
+
+Nearly all of the time goes into compiling. Half of that is optimisation, which problems this small do not repay: it is
+left out, except where a test asks for it (``optimised``). What is compiled is kept for the other workers and for the
+processes that tests start, in a folder of this run alone: no test meets anything that an older run has left.
+"""
 
 from __future__ import annotations
 
+import os
+import shutil
+import tempfile
+
+import pytest
 from hypothesis import HealthCheck, settings
+
+# All of this before JAX is imported; workers and processes that tests start inherit it.
+os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+OWN_CACHE = None if "JAX_COMPILATION_CACHE_DIR" in os.environ else tempfile.mkdtemp(prefix="dsom-tests-")
+if OWN_CACHE:
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = OWN_CACHE
 
 settings.register_profile(
     "stable",
@@ -13,3 +30,31 @@ settings.register_profile(
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
 )
 settings.load_profile("stable")
+
+
+def pytest_unconfigure() -> None:
+    """The process that made the folder removes it; workers found it in their environment."""
+    if OWN_CACHE:
+        shutil.rmtree(OWN_CACHE, ignore_errors=True)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _small_blocks():
+    """Grids of free cells are filled up to 512 in place of 4096: the rooms of most tests have about 300.
+
+    The tests of the likelihood grid itself take the true number.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("dsom_jax.proposals.likelihood_grid._BLOCK", 512)
+        yield
+
+
+@pytest.fixture(scope="module")
+def optimised():
+    """Compilation as users have it: for promises about bits, and for accuracy."""
+    import jax
+
+    before = jax.config.jax_disable_most_optimizations
+    jax.config.update("jax_disable_most_optimizations", False)
+    yield
+    jax.config.update("jax_disable_most_optimizations", before)

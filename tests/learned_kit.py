@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
-import jax
-
 import tiny_world
 from dsom_jax.filters.learned import Prior
 from dsom_jax.filters.pf_net import pf_net
@@ -27,13 +23,6 @@ DATA = SequenceConfig(
     tiny_world.LIDAR, 1, drives=4, length=12, window=4, obstacles=2, removed=1,
     drive=DriveConfig(update_min_d=0.2, margin=0.3, near=1.0),
 )  # fmt: skip
-
-
-def quick_compilation() -> Iterator[None]:
-    """Body of a fixture: most of the time goes into compiling, half of it into what tiny problems do not repay."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
 
 
 def make(kind: str, particles: int = 24, prior: Prior | None = None):

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dsom_jax import bench, checkpoint, evaluate, localize, train
+from dsom_jax import bench, checkpoint, evaluate, localize, train, train_filter
 from dsom_jax.data import save_tum
 from dsom_jax.errors import UserError, run_cli
 from dsom_jax.nn import DSOMConfig, create
@@ -225,7 +225,7 @@ def test_bench_with_a_checkpoint_that_no_method_draws_from(refused):
     assert "--checkpoint net" in error and "no use" in error and "adam_dsom" in error
 
 
-COMMANDS = [name for name in ("localize", "bench", "train", "evaluate") if importlib.util.find_spec(f"dsom_jax.{name}")]
+COMMANDS = ("localize", "bench", "train", "train_filter", "evaluate")
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -251,7 +251,7 @@ def test_words_that_cannot_be_read(refused, words, fragments):
     assert all(fragment in error for fragment in fragments), error
 
 
-@pytest.mark.parametrize("main", [bench.main, train.main, localize.main, evaluate.main])
+@pytest.mark.parametrize("main", [bench.main, train.main, train_filter.main, localize.main, evaluate.main])
 def test_help_is_no_error(main, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["command", "--help"])
     with pytest.raises(SystemExit) as stop:

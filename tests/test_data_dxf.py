@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given
@@ -14,24 +11,8 @@ from dsom_jax.data import load_map, save_ros_map, se2
 from dsom_jax.data.dxf import Drawing, load_drawing
 from dsom_jax.data.log import Report
 from dsom_jax.data.rasterize import enclosed, reachable, touched_cells
-from dsom_jax.occupancy import OccupancyGrid, is_free
-from tiny_drawing import ROOM, room, write
+from tiny_drawing import ROOM, free_at, load, occupied_at, room, write
 from tiny_world import grid as tiny_room
-
-
-def load(tmp_path, draw, report=None, **fields) -> OccupancyGrid:
-    return load_drawing(write(tmp_path / "plan.dxf", draw), Drawing(**fields), report)
-
-
-def occupied_at(grid, points) -> np.ndarray:
-    """Whether the cells under map-frame points (N, 2) are walls."""
-    local = np.asarray(grid.to_grid(jnp.asarray(np.c_[points, np.zeros(len(points))], jnp.float32)))
-    j, i = np.floor(local[:, :2].T / grid.resolution).astype(int)
-    return np.asarray(grid.occupied)[i, j]
-
-
-def free_at(grid, *points) -> list[bool]:
-    return np.asarray(is_free(grid, jnp.asarray([[x, y, 0.0] for x, y in points]))).tolist()
 
 
 def room_to_cells(a, b, size: int) -> np.ndarray:
@@ -89,74 +70,26 @@ def test_a_room_in_metres(tmp_path):
 
 @pytest.mark.parametrize(
     ("code", "units", "factor"),
-    [(4, "", 0.001), (5, "", 0.01), (6, "", 1.0), (2, "", 0.3048), (1, "", 0.0254), (0, "m", 1.0), (4, "m", 1.0)],
+    [
+        (4, "", 0.001),
+        (5, "", 0.01),
+        (14, "", 0.1),
+        (6, "", 1.0),
+        (7, "", 1000.0),
+        (2, "", 0.3048),
+        (1, "", 0.0254),
+        (10, "", 0.9144),
+        (0, "m", 1.0),
+        (4, "m", 1.0),
+    ],
 )
 def test_units_of_the_drawing_or_as_told(tmp_path, code, units, factor):
     path = write(tmp_path / "plan.dxf", lambda m: room(m, [(x / factor, y / factor) for x, y in ROOM]), units=code)
     grid = load_drawing(path, Drawing(resolution=0.25, units=units))
     assert int(grid.free.sum()) == 23 * 15 and free_at(grid, (0.2, 0.2), (5.8, 3.8)) == [True, True]
-
-
-def on_circle(centre, radius, degrees):
-    angles = np.radians(degrees)
-    return np.c_[centre[0] + radius * np.cos(angles), centre[1] + radius * np.sin(angles)]
-
-
-@pytest.mark.parametrize("version", ["R12", "R2000", "R2018"])
-def test_every_kind_of_line_is_where_it_should_be(tmp_path, version):
-    def draw(msp):
-        room(msp, [(-10, -10), (10, -10), (10, 10), (-10, 10)]) if version != "R12" else msp.add_polyline2d(
-            [(-10, -10), (10, -10), (10, 10), (-10, 10)], close=True
-        )
-        msp.add_line((-8, -8, 0), (-5, -6, 3))  # seen from above
-        msp.add_arc((0, 0), 3, 90, 200)
-        msp.add_circle((6, 6), 2)
-        # A bulge of 1 is half a circle to the right of the way, one of tan(angle / 4) an arc of that angle.
-        msp.add_polyline2d([(-6, 4, 1), (-2, 4, 0)], format="xyb")
-        if version != "R12":
-            msp.add_lwpolyline([(2, -6, math.tan(math.pi / 8)), (4, -4, 0)], format="xyb")
-            msp.add_ellipse((-6, -2), major_axis=(2, 0), ratio=0.5)
-            msp.add_spline_control_frame([(2, 0), (4, 2), (6, 0), (8, 2)])
-
-    grid = load_drawing(write(tmp_path / "plan.dxf", draw, version=version), Drawing(resolution=0.1, units="m"))
-    t = np.linspace(0, 1, 50)[:, None]
-    wanted = [
-        (1 - t) * [-8, -8] + t * [-5, -6], on_circle((0, 0), 3, np.linspace(90, 200, 60)),
-        on_circle((6, 6), 2, np.linspace(0, 360, 90)), on_circle((-4, 4), 2, np.linspace(180, 360, 60)),
-    ]  # fmt: skip
-    empty = [on_circle((0, 0), 3, np.linspace(-150, 80, 60)), on_circle((-4, 4), 2, np.linspace(10, 170, 60))]
-    if version != "R12":
-        # A quarter circle to the right from (2, -6) to (4, -4) is centred on (2, -4).
-        wanted.append(on_circle((2, -4), 2, np.linspace(-90, 0, 40)))
-        wanted.append(on_circle((0, 0), 1, np.linspace(0, 360, 80)) * [2, 1] + [-6, -2])
-    nudges = 0.06 * np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)])
-    for points in wanted:
-        # Bezier arcs are within 3e-4 of their radius, flat pieces within a tenth of a cell.
-        assert np.any([occupied_at(grid, points + nudge) for nudge in nudges], axis=0).all()
-    for points in empty:
-        assert occupied_at(grid, points).mean() < 0.1
-
-
-def test_blocks_nested_turned_scaled_and_in_arrays(tmp_path):
-    def draw(msp):
-        blocks = msp.doc.blocks
-        leg = blocks.new("LEG")
-        leg.add_line((0, 0), (1, 0))
-        table = blocks.new("TABLE")
-        table.add_blockref("LEG", (0, 0))
-        table.add_blockref("LEG", (0, 2), dxfattribs={"rotation": 90})
-        room(msp, [(-20, -20), (20, -20), (20, 20), (-20, 20)])
-        msp.add_blockref("TABLE", (5, 5), dxfattribs={"rotation": 180, "xscale": 2, "yscale": 2})
-        array = msp.add_blockref("LEG", (-10, -10))
-        array.dxf.row_count, array.dxf.column_count = 2, 3
-        array.dxf.row_spacing, array.dxf.column_spacing = 4, 3
-
-    grid = load(tmp_path, draw)
-    # Turned half round and doubled: the first leg is from (5, 5) to (3, 5), the second from (5, 1) to (5, -1).
-    assert occupied_at(grid, [(4.5, 5), (3.2, 5), (5, 0.5), (5, -0.8)]).all()
-    assert not occupied_at(grid, [(5.5, 5), (5, 2), (2.5, 5)]).any()
-    legs = [(-9.5 + 3 * c, -10 + 4 * r) for c in range(3) for r in range(2)]
-    assert occupied_at(grid, legs).all() and not occupied_at(grid, [(-0.5, -10), (-8.5, -10), (-9.5, -2)]).any()
+    # The place to start from is in the drawing's unit, too.
+    started = load_drawing(path, Drawing(resolution=0.25, units=units, start=(5 / factor, 1 / factor)))
+    assert int(started.free.sum()) == 23 * 15
 
 
 @pytest.fixture

@@ -23,12 +23,10 @@ from dsom_jax.nn.local_view import (
     scan_view,
 )
 from dsom_jax.occupancy import from_cells
-from learned_kit import quick_compilation
 from reference.local_view import crop
 
 draw = jax.jit(scan_view, static_argnums=(1, 2))
 look = jax.jit(local_view, static_argnums=2)
-quick = pytest.fixture(scope="module", autouse=True)(quick_compilation)
 VIEW = ViewConfig(cells=16, resolution=0.3, map_resolution=0.25, beams=32, reach_min=5.0)
 
 
@@ -88,9 +86,9 @@ def test_gradient_along_a_path_adds_up_to_the_difference():
     assert np.isfinite(slopes).all() and np.abs(slopes).max() > 1
 
 
-def square_room() -> tuple[np.ndarray, LidarConfig]:
-    """Ranges of a robot in the middle of a room of 4 m x 4 m."""
-    lidar = LidarConfig(beams=360, range_max=5.0)
+def square_room(mount=(0.0, 0.0, 0.0)) -> tuple[np.ndarray, LidarConfig]:
+    """Ranges of a sensor in the middle of a room of 4 m x 4 m, parallel to the robot's axes."""
+    lidar = LidarConfig(beams=360, range_max=5.0, mount=mount)
     angles = lidar.angles()
     return (2.0 / np.maximum(np.abs(np.cos(angles)), np.abs(np.sin(angles)))).astype(np.float32), lidar
 
@@ -105,6 +103,40 @@ def test_scan_of_a_square_room():
     # Walls at 2 m lie between the centres at 1.95 and 2.25 m.
     assert (hit[(depth < 1.7) | (depth > 2.3)] == 0).all() and (hit[np.isclose(depth, 1.95)] > 0.5).all()
     assert (through[depth < 1.6] == 1).all() and (through[depth > 2.0] == 0).all()
+
+
+def test_a_scan_is_drawn_from_where_the_sensor_is():
+    """A sensor ahead of the base, to its right and turned, in the middle of the room: the walls lie about it."""
+    ranges, lidar = square_room((0.6, -0.3, 2.5))
+    hit, through, seen = np.moveaxis(picture(draw(jnp.asarray(ranges), lidar, VIEW)), -1, 0)
+    centres = (np.arange(16) + 0.5 - 8) * 0.3
+    x, y = np.meshgrid(centres - 0.6, centres + 0.3)
+    depth = np.maximum(np.abs(x), np.abs(y))
+    assert (hit[(depth < 1.7) | (depth > 2.3)] == 0).all() and (hit[np.isclose(depth, 1.95)] > 0.5).all()
+    assert (through[depth < 1.6] == 1).all() and (through[depth > 2.0] == 0).all() and (seen == 1).all()
+    assert hit.max() == 1.0  # however many beams end there
+
+
+def test_what_lies_beyond_the_range_is_not_seen():
+    near = LidarConfig(beams=360, range_max=1.5)
+    _, through, seen = np.moveaxis(picture(draw(jnp.full(360, jnp.inf), near, VIEW)), -1, 0)
+    centres = (np.arange(16) + 0.5 - 8) * 0.3
+    distance = np.hypot(*np.meshgrid(centres, centres))
+    np.testing.assert_array_equal(seen, distance < 1.5)
+    assert (through[distance < 1.2] == 1).all() and not through[distance > 1.5].any()
+
+
+def test_patches_are_squares_and_four_in_a_row_make_one():
+    """The network joins every four patches that follow each other."""
+    order = patch_order(VIEW)
+    assert sorted(order.ravel().tolist()) == list(range(256))
+    for cells, side in ((order, 4), (order.reshape(-1, 64), 8)):
+        for square in cells:
+            i, j = square // 16, square % 16
+            assert np.ptp(i) == np.ptp(j) == side - 1 and i.min() % side == j.min() % side == 0
+    # Rows along y, columns along x, in a patch and among the patches.
+    assert (order[0] == [i * 16 + j for i in range(4) for j in range(4)]).all()
+    assert order[:4, 0].tolist() == [0, 4, 64, 68] and order[4, 0] == 8
 
 
 def test_invalid_beams_are_not_seen_and_missing_returns_see_through():

@@ -12,7 +12,7 @@ import pytest
 
 import tiny_world
 from dsom_jax.filters.adam_memory import AdamMemory
-from dsom_jax.filters.adam_robust import AdamRobust, RobustConfig
+from dsom_jax.filters.adam_robust import AdamRobust, RobustConfig, RobustState
 from dsom_jax.filters.methods import Settings, make_filter
 from dsom_jax.geometry import compose, inverse, wrap_angle
 from dsom_jax.montecarlo import run, run_keys
@@ -131,6 +131,9 @@ def test_the_first_scan_is_that_of_the_likelihood_grid(memory):
     plain = memory.likelihood.prepare(first)
     belief = memory.prepare(first).posterior
     np.testing.assert_allclose(belief.mass / belief.cumulative[-1], plain.mass / plain.cumulative[-1], atol=1e-7)
+    # Whatever its number, and the way that is said to lie behind: nothing is known of where it began.
+    late = memory.prepare(first._replace(index=jnp.int32(7), odometry=jnp.array([2.0, 0.0, 1.0]))).posterior
+    np.testing.assert_array_equal(late.mass, belief.mass)
 
 
 def test_log_prior_is_the_density_of_the_belief_before_the_scan(memory):
@@ -157,7 +160,24 @@ def test_the_first_update_is_that_of_adam_robust(filters):
     np.testing.assert_allclose(with_memory.state.log_weights, without.state.log_weights, atol=2e-3)
 
 
-def test_it_finds_the_robot_keeps_it_and_run_r_is_the_run_alone(filters):
+def test_shares_of_grid_and_particles(filters):
+    """Weights of particles and of the grid's poses in an update without evidence: 1 - a and a, by Bayes' rule."""
+    blind = Inputs(jnp.full(LIDAR.beams, jnp.nan), jnp.zeros(3), jnp.int32(0))
+    step = jax.jit(lambda f, key, state, prepared: f.step(key, state, blind, prepared)[0])
+    prepared, belief = filters[0].recall(filters[0].begin(), blind)
+    poses, _ = filters[0].space.sample(jax.random.key(1), None, 150)
+    state = RobustState(poses, jnp.full(150, -math.log(150)), jnp.float32(0.5), jnp.int32(2))
+    masses = {}
+    for share in (0.5, 0.1):
+        after = step(replace(filters[0], share=share), jax.random.key(0), state, prepared)
+        # The first half is redrawn, as the filter is lost by half.
+        masses[share] = float(jnp.exp(after.log_weights)[:75].sum())
+    # Both halves stand for the same uniform belief; some kept particles drift into walls but still weigh.
+    assert masses == {share: pytest.approx(share, abs=0.02) for share in masses}
+    assert float(belief.sum()) == pytest.approx(1.0, abs=1e-5)
+
+
+def test_it_finds_the_robot_keeps_it_and_run_r_is_the_run_alone(filters, optimised):
     episode = tiny_world.drive()
     keys = run_keys(3, 0, 6)
     info = run(filters[0], episode, keys).info

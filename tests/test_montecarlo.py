@@ -19,6 +19,8 @@ from dsom_jax.episode import Episode
 from dsom_jax.resampling import resample
 from dsom_jax.types import Inputs
 
+pytestmark = pytest.mark.usefixtures("optimised")
+
 
 class Info(NamedTuple):
     mean: Any
@@ -208,7 +210,12 @@ np.savez(sys.argv[1], *jax.tree.leaves(result))
 def test_two_devices_give_the_same_numbers(tmp_path):
     flags = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=2"
     path = os.pathsep.join([os.path.dirname(__file__), *filter(None, [os.environ.get("PYTHONPATH")])])
-    env = os.environ | {"XLA_FLAGS": flags, "PYTHONPATH": path, "JAX_PLATFORMS": "cpu"}
+    env = os.environ | {
+        "XLA_FLAGS": flags,
+        "PYTHONPATH": path,
+        "JAX_PLATFORMS": "cpu",
+        "JAX_DISABLE_MOST_OPTIMIZATIONS": "0",
+    }
     file = tmp_path / "two.npz"
     subprocess.run([sys.executable, "-c", CHILD, str(file)], env=env, check=True, timeout=120)
     # An odd number of runs: the last device is filled up, and the filling cut off.

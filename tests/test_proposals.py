@@ -36,6 +36,13 @@ def inputs(ranges, index=0):
     return Inputs(jnp.asarray(ranges, jnp.float32), jnp.zeros(3), jnp.int32(index))
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _true_blocks():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("dsom_jax.proposals.likelihood_grid._BLOCK", 4096)
+        yield
+
+
 @pytest.fixture(scope="module")
 def grid():
     return tiny_world.grid()

@@ -20,6 +20,7 @@ from dsom_jax.occupancy import from_cells
 from dsom_jax.raycast import RaycastConfig, make_tables
 from reference import rays
 
+pytestmark = pytest.mark.usefixtures("optimised")
 cast_rays = jax.jit(raycast.cast_rays, static_argnums=2)
 EXACT = RaycastConfig("exact")
 CELLS = 2e-3  # promised accuracy, and the clearance of corners below which no side can be told
@@ -172,6 +173,23 @@ def test_batches_of_any_shape_give_the_same_rays(method, house):
     same(cast_rays(house[method], poses[64], FAN), flat[64])
     mapped = jax.jit(jax.vmap(lambda p: raycast.cast_rays(house[method], p, FAN)))
     same(mapped(poses[:60].reshape(2, 30, 3)), flat[:60].reshape(2, 30, -1))
+
+
+@pytest.mark.parametrize("mapped", ["squares", "x", "bearings", "limit"])
+def test_a_march_may_be_mapped_over_any_of_its_arguments(mapped):
+    squares = np.stack([empty_squares(jnp.asarray(np.pad(random_map(s, (9, 9)), 1, constant_values=True)), 7)
+                        for s in range(2)])  # fmt: skip
+    arguments = {
+        "squares": squares, "x": np.array([[1.2, 6.3], [4.4, 7.5]]), "y": np.array([2.5, 6.5]),
+        "theta": np.array([0.3, -2.0]), "bearings": np.array([[0.0, 1.7], [0.9, 3.0]]), "limit": np.array([3.0, 9.0]),
+    }  # fmt: skip
+    first = {name: v if name in ("y", "theta", mapped) else v[0] for name, v in arguments.items()}
+    march = jax.jit(raycast.march)
+    together = jax.jit(jax.vmap(raycast.march, [0 if name == mapped else None for name in first]))(*first.values())
+    for n, row in enumerate(np.asarray(together)):
+        alone = {name: v[n] if name == mapped else v for name, v in first.items()}
+        np.testing.assert_allclose(row, march(*alone.values()), rtol=1e-5, atol=1e-5)
+    assert np.isfinite(together).any() and not np.array_equal(*np.asarray(together))
 
 
 def test_worlds_made_inside_of_jit():

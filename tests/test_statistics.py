@@ -12,10 +12,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from dsom_jax import statistics as s
-from dsom_jax.errors import UserError
-from dsom_jax.metrics import Runs, bootstrap
-from dsom_jax.report import read_runs, write_runs
-from dsom_jax.run_table import join, paired, run_rows
+from dsom_jax.metrics import bootstrap
 
 flags = st.lists(st.tuples(st.booleans(), st.booleans()), max_size=60)
 
@@ -65,6 +62,18 @@ def test_signed_rank_leaves_out_what_has_no_number_and_keeps_ties():
     rng = np.random.default_rng(0)
     x, y = rng.normal(size=80), rng.normal(0.4, 1, 80)
     assert s.signed_rank(x, y).p == pytest.approx(stats.wilcoxon(x, y).pvalue, rel=1e-12)
+
+
+def test_zero_differences_take_ranks_but_no_side():
+    """Pratt 1959: the ranks of zeros are given away before those of the others; normal approximation."""
+    difference = np.random.default_rng(0).normal(0.3, 1, 80)
+    difference[::4] = 0.0
+    ranks, n, zeros = stats.rankdata(np.abs(difference)), 80, 20
+    positive = ranks[difference > 0].sum()
+    mean = (n * (n + 1) - zeros * (zeros + 1)) / 4
+    variance = (n * (n + 1) * (2 * n + 1) - zeros * (zeros + 1) * (2 * zeros + 1)) / 24
+    p = 2 * stats.norm.sf(abs(positive - mean) / math.sqrt(variance))
+    assert s.signed_rank(difference, np.zeros(n)).p == pytest.approx(p, rel=1e-6)
 
 
 @given(st.lists(st.floats(0, 1), min_size=1, max_size=12))
@@ -128,10 +137,21 @@ def test_the_interval_covers_the_truth_as_often_as_it_says():
     assert covered >= 104 and naive < 72
 
 
+def test_within_one_cluster_it_is_the_plain_bootstrap_too():
+    values = np.random.default_rng(5).normal(size=60)
+    low, high = s.clustered_bootstrap(values, np.zeros(60), resamples=20_000)
+    assert high - low == pytest.approx(2 * 1.96 * values.std() / math.sqrt(60), rel=0.05)
+    assert [low, high] != s.clustered_bootstrap(values, np.zeros(60), seed=1, resamples=20_000)
+    (only, same) = s.clustered_bootstrap(values, np.zeros(60), resamples=1)
+    assert only == same != values.mean()
+
+
 def test_unequal_clusters_count_by_their_runs():
     values, clusters = np.array([1.0, 1, 1, 1, 5]), np.array([0, 0, 0, 0, 1])
     low, high = s.clustered_bootstrap(values, clusters)
     assert (low, high) == (1.0, 5.0)
+    # Half of the draws have both clusters: (4 * 1 + 5) / 5. A quarter each has one of them twice.
+    assert s.clustered_bootstrap(values, clusters, level=0.4) == [1.8, 1.8]
     assert s.paired_difference(values, np.zeros(5), clusters).mean == pytest.approx(1.8)
 
 
@@ -191,6 +211,23 @@ def test_verdicts(evidence, outcome):
     assert str(verdict).splitlines()[0] == f"faster: {outcome}" and len(str(verdict).splitlines()) == 1 + len(evidence)
 
 
+def test_how_sure_one_wants_to_be():
+    assert s.decide("", [piece(-2, -1, p=0.1)]).outcome == "does not hold here"
+    assert s.decide("", [piece(-2, -1, p=0.1)], alpha=0.2).outcome == "holds"
+
+
+def test_evidence_has_the_p_value_of_its_test_and_the_wanted_side():
+    sequence = np.repeat(np.arange(10), 4)
+    b = np.random.default_rng(0).normal(size=40)
+    a = b - np.random.default_rng(1).uniform(0.5, 1, 40)
+    less, greater = (s.value_evidence("E_pos, m", a, b, sequence, wanted=side) for side in ("less", "greater"))
+    assert less.p == greater.p == s.signed_rank(a, b).p < 1e-6
+    assert (less.status(), greater.status()) == ("supports", "contradicts")
+    rate = s.rate_evidence("converged", b > 0, a > 0, sequence)
+    assert rate.p == s.mcnemar(b > 0, a > 0).p and rate.wanted == "greater"
+    assert rate.estimate == pytest.approx((b > 0).mean() - (a > 0).mean())
+
+
 def test_no_evidence_is_no_verdict():
     with pytest.raises(ValueError, match="at least one"):
         s.decide("faster", [])
@@ -201,61 +238,3 @@ def test_a_family_is_corrected_together():
     corrected = s.corrected(family)
     assert [e.p for e in corrected] == [pytest.approx(0.06), None, pytest.approx(0.06)]
     assert s.decide("", family).outcome == "holds" and s.decide("", corrected).outcome == "holds in part"
-
-
-def runs_of(steps, e_pos) -> Runs:
-    """A phase of as many runs; half of the ten updates after convergence stayed."""
-    steps, zero = np.asarray(steps), np.zeros(len(steps))
-    after = np.where(steps >= 0, 10, 0)
-    return Runs(steps, after, after // 2, steps < 0, np.asarray(e_pos, float), zero, zero + 20, zero, zero)
-
-
-def made_up(better=-0.1) -> tuple:
-    """Two methods on 8 sequences of 25 runs: b converges less often and errs more, everywhere."""
-    rng, rows = np.random.default_rng(4), []
-    for sequence in range(8):
-        hard = rng.normal(0, 0.05)
-        for method, shift, rate in (("a", better, 0.95), ("b", 0.0, 0.5)):
-            steps = np.where(rng.uniform(size=25) < rate, rng.integers(0, 9, 25), -1)
-            rows.append(
-                run_rows(method, "global", sequence, 0, runs_of(steps, 0.5 + hard + shift + rng.normal(0, 0.02, 25)))
-            )
-    return tuple(rows)
-
-
-def test_from_runs_to_a_verdict(tmp_path):
-    # Rows need not be in order.
-    table = join(made_up()[::-1])
-    write_runs(tmp_path / "runs.npz", table)
-    a, b = paired(read_runs(tmp_path / "runs.npz"), "a", "b", "global")
-    assert (a.sequence == np.repeat(np.arange(8), 25)).all() and (a.run == np.tile(np.arange(25), 8)).all()
-    assert a.method.tolist() == ["a"] * 200 and (np.isnan(a.retention) == ~a.converged).all()
-    family = s.corrected([
-        s.rate_evidence("converged", a.converged, b.converged, a.sequence),
-        s.value_evidence("E_pos, m", a.e_pos_m, b.e_pos_m, a.sequence),
-        s.value_evidence("retention", a.retention, b.retention, a.sequence, wanted="greater"),
-    ])  # fmt: skip
-    assert [e.status() for e in family] == ["supports", "supports", "undecided"]
-    assert s.signed_rank(a.converging_steps, b.converging_steps).pairs == (a.converged & b.converged).sum()
-    assert family[1].estimate == pytest.approx(-0.1, abs=0.01) and family[1].low < -0.1 < family[1].high
-    assert s.decide("a is better than b", family[:2]).outcome == "holds"
-    assert s.decide(
-        "b is better than a", [s.rate_evidence("converged", b.converged, a.converged, a.sequence)]
-    ).outcome == ("does not hold here")
-
-
-def test_tables_that_do_not_fit(tmp_path):
-    rows = made_up()
-    with pytest.raises(ValueError, match="same sequences and seeds"):
-        paired(join(rows[:-1]), "a", "b", "global")
-    with pytest.raises(ValueError, match=r"no run of c.*a, b"):
-        paired(join(rows), "a", "c", "global")
-    for name, content in (("words.npz", b"to be"), ("empty.npz", b"")):
-        (tmp_path / name).write_bytes(content)
-        with pytest.raises(UserError, match="not a table of runs"):
-            read_runs(tmp_path / name)
-    np.savez(tmp_path / "other.npz", x=1)
-    with pytest.raises(UserError, match="not a table of runs"):
-        read_runs(tmp_path / "other.npz")
-    with pytest.raises(UserError, match="no such table"):
-        read_runs(tmp_path / "nowhere.npz")

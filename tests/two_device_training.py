@@ -1,4 +1,4 @@
-"""Run by test_training_sharding in a process of its own: losses of a few steps, as JSON."""
+"""Losses of a few steps; test_training_sharding runs this in a process of its own, too, which prints them as JSON."""
 
 from __future__ import annotations
 
@@ -36,5 +36,5 @@ def losses(worlds: int, scans: int, steps: int = 6) -> list[float]:
 
 
 if __name__ == "__main__":
-    assert jax.device_count() == int(sys.argv[1])
-    print(json.dumps([losses(2, 3), losses(1, 4)]))
+    assert jax.device_count() == 2
+    print(json.dumps([losses(*case) for case in json.loads(sys.argv[1])]))

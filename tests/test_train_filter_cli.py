@@ -1,0 +1,117 @@
+"""``python -m dsom_jax.train_filter``: it resumes bit for bit, and bad input is one line."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import yaml
+
+import dsom_jax
+import tiny_world
+from dsom_jax import checkpoint, train_filter
+from dsom_jax.errors import UserError, run_cli
+from dsom_jax.training import filter_evaluation
+from dsom_jax.training.sequences import Window
+from learned_kit import training
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("train_filter")
+    dsom_jax.save_ros_map(tiny_world.grid(), folder / "map.yaml")
+    config = {
+        "model": {"view": {"cells": 8, "map_resolution": 0.25, "beams": 32, "reach_min": 5.0}, "width": 4,
+                  "features": 4, "hidden": 4},
+        "data": {"lidar": {"beams": 32, "angle_increment": 2 * np.pi / 32, "range_max": 5.0}, "beam_step": 1,
+                 "drives": 2, "length": 6, "window": 3, "obstacles": 0, "removed": 0,
+                 "drive": {"update_min_d": 0.2}},
+        "batch": 2, "particles": 6,
+    }  # fmt: skip
+    (folder / "tiny.yaml").write_text(yaml.safe_dump(config))
+    return folder
+
+
+def command(files: Path, monkeypatch, out: str, *words: str) -> None:
+    given = ("--filter", "pfrnn", "--config", str(files / "tiny.yaml"), "--maps", str(files / "map.yaml"))
+    rest = ("--steps", "4", "--save-steps", "2", "--out", str(files / out), *words)
+    monkeypatch.setattr(sys, "argv", ["train_filter", *given, *rest])
+    run_cli(train_filter.main)
+
+
+def weights(folder: Path) -> bytes:
+    return b"".join(np.asarray(x).tobytes() for x in jax.tree.leaves(checkpoint.load(folder, kind="pfrnn")))
+
+
+def test_a_run_that_lost_its_end_resumes_bit_for_bit(files, monkeypatch):
+    made, parts = [], train_filter.parts
+
+    def compiled_once(run):
+        made.append(made[0] if made else parts(run))
+        return made[0]._replace(state=train_filter.first_state(run))
+
+    def blank_windows(key, pool, config, resolution, count, strays):
+        """Robots that stand at the start of their paths and see nothing: no scans to compile."""
+        poses = jnp.broadcast_to(pool.poses[:count, :1], (count, config.window, 3))
+        blank = jnp.full((count, config.window, config.lidar.beams), jnp.inf)
+        return Window(pool.where[:count], blank, jnp.zeros_like(poses), poses, jnp.zeros((count, strays, 3)))
+
+    monkeypatch.setattr(train_filter, "parts", compiled_once)
+    monkeypatch.setattr(filter_evaluation, "make_windows", blank_windows)
+    command(files, monkeypatch, "run")
+    whole, log = weights(files / "run"), (files / "run" / "metrics.jsonl").read_text()
+    record = json.loads((files / "run" / "provenance.json").read_text())
+    assert (record["kind"], record["steps"], record["data"]) == ("pfrnn", 4, ["map.yaml"])
+    assert record["samples"] == 4 * 2 * 3
+    assert record["metrics"]["sequences"] == 32 and record["metrics"]["updates"] == 6
+    # As if it had been killed after the third step: the last state is of the second.
+    shutil.rmtree(files / "run" / "state-00000004")
+    command(files, monkeypatch, "run", "--resume")
+    assert weights(files / "run") == whole
+    numbers = [{k: v for k, v in json.loads(line).items() if k != "seconds"} for line in log.splitlines()]
+    again = (files / "run" / "metrics.jsonl").read_text().splitlines()
+    assert [{k: v for k, v in json.loads(line).items() if k != "seconds"} for line in again] == numbers
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--steps", "0"), "--steps 0"),
+        (("--filter", "magic"), "filter"),
+        (("--maps", "nowhere.yaml"), "nowhere.yaml"),
+        (("--config", "nowhere.yaml"), "nowhere.yaml"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(files, monkeypatch, capsys, words, message):
+    with pytest.raises(SystemExit) as stop:
+        command(files, monkeypatch, "never", *words)
+    error = capsys.readouterr().err
+    assert stop.value.code == 2 and error.count("\n") == 1 and message in error
+    assert not (files / "never").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [("colour: 1", "unknown field colour"), ("data: {window: 1}", "window = 1"), ("strays: 2.0", "strays"),
+     ("model: {hidden: 3}", "unknown field hidden"), ("batch: 0", "batch"), ("start_xy: [2.0, 1.0]", "start_xy")],
+)  # fmt: skip
+def test_bad_configurations(tmp_path, text, message):
+    with pytest.raises(UserError, match=message):
+        train_filter.Arguments("pf_net").read_config(yaml.safe_load(text), "c.yaml")
+
+
+def test_a_run_of_another_filter_is_not_resumed(tmp_path):
+    create = train_filter.FilterRun(tmp_path, training("pfrnn"), (), 3)
+    train_filter.create(create)
+    with pytest.raises(UserError, match="unknown field"):
+        train_filter.open_run(train_filter.Arguments("pf_net", out=tmp_path, resume=True))
+    with pytest.raises(UserError, match="not empty"):
+        train_filter.open_run(train_filter.Arguments("pfrnn", out=tmp_path))
+    with pytest.raises(UserError, match="--steps 5"):
+        train_filter.open_run(train_filter.Arguments("pfrnn", out=tmp_path, resume=True, steps=5))
