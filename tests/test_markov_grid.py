@@ -169,7 +169,7 @@ def test_shares_of_grid_and_particles(filters):
     state = RobustState(poses, jnp.full(150, -math.log(150)), jnp.float32(0.5), jnp.int32(2))
     masses = {}
     for share in (0.5, 0.1):
-        after = step(replace(filters[0], share=share), jax.random.key(0), state, prepared)
+        after = step(replace(filters[0], share=(share, share)), jax.random.key(0), state, prepared)
         # The first half is redrawn, as the filter is lost by half.
         masses[share] = float(jnp.exp(after.log_weights)[:75].sum())
     # Both halves stand for the same uniform belief; some kept particles drift into walls but still weigh.
