@@ -66,8 +66,10 @@ VARIANTS: dict[str, Callable[[Settings], Settings]] = {
     "no-memory-eps-1e-3": memoryless(kidnap=1e-3),
     "no-memory-eps-1e-7": memoryless(kidnap=1e-7),
     "memory-eps-1e-4": markov(kidnap=1e-4),
-    "memory-eps-1e-9": markov(kidnap=1e-9),
+    "memory-eps-1e-6": markov(kidnap=1e-6),
     "memory-slip-0": markov(slip=0.0),
+    "memory-share-0.5": lambda s: replace(s, memory_share=(0.5, 0.5)),
+    "memory-temper-0.5": lambda s: replace(s, memory_temper=0.5),
     "flatten-0": robust(flatten=0.0),
     "flatten-0.3": robust(flatten=0.3),
     "slip-0": slip(0.0),
@@ -162,7 +164,7 @@ HEAD = f"""\
 # What each idea of AdaM robust is worth
 
 Written by `python experiments/robust/ablation.py`; do not edit. One choice is changed at a time; base: memory with eps
-{REAL.markov.kidnap:g} and slip {REAL.markov.slip:g}, flatten {REAL.robust.flatten:g}, low_min {REAL.robust.low_min:g},
+{REAL.markov.kidnap:g}, slip {REAL.markov.slip:g} and temper {REAL.memory_temper:g}, flatten {REAL.robust.flatten:g}, low_min {REAL.robust.low_min:g},
 temper {REAL.robust.model.temper:.3g}, sigma_hit {REAL.robust.model.sigma_hit:g} m, surface
 {REAL.robust_raycast.surface:g}.
 The first numbers are for the start without prior, the last four for the kidnapping that follows. Terms as in
