@@ -164,7 +164,8 @@ HEAD = f"""\
 # What each idea of AdaM robust is worth
 
 Written by `python experiments/robust/ablation.py`; do not edit. One choice is changed at a time; base: memory with eps
-{REAL.markov.kidnap:g}, slip {REAL.markov.slip:g} and temper {REAL.memory_temper:g}, flatten {REAL.robust.flatten:g}, low_min {REAL.robust.low_min:g},
+{REAL.markov.kidnap:g}, slip {REAL.markov.slip:g} and temper {REAL.memory_temper:g},
+flatten {REAL.robust.flatten:g}, low_min {REAL.robust.low_min:g},
 temper {REAL.robust.model.temper:.3g}, sigma_hit {REAL.robust.model.sigma_hit:g} m, surface
 {REAL.robust_raycast.surface:g}.
 The first numbers are for the start without prior, the last four for the kidnapping that follows. Terms as in
