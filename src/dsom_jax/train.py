@@ -10,9 +10,10 @@ import jax
 
 from dsom_jax import checkpoint
 from dsom_jax.cli import parse
+from dsom_jax.data.open_map import load_maps
 from dsom_jax.errors import UserError, run_cli
 from dsom_jax.nn import DSOM
-from dsom_jax.occupancy import OccupancyGrid, resample
+from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.run_folder import Run, check_new, create, read_yaml, reopen
 from dsom_jax.trainer import Parts, check_length, train
 from dsom_jax.training.batches import make_batch, plain
@@ -70,17 +71,6 @@ class Material(NamedTuple):
 def read_config(path: Path | None) -> TrainConfig:
     """TrainConfig from a YAML file with some of its fields."""
     return override(TrainConfig(), read_yaml(path), str(path))
-
-
-def load_maps(paths: tuple[Path, ...], resolution: float) -> list[OccupancyGrid]:
-    """Maps at the network's resolution, each with free space."""
-    from dsom_jax.data.open_map import load_map
-
-    grids = [resample(load_map(path), resolution) for path in paths]
-    for path, grid in zip(paths, grids, strict=True):
-        if not bool(grid.free.any()):
-            raise UserError(f"{path}: no free cell at {resolution:.3f} m per cell; give a map with free space")
-    return grids
 
 
 def open_run(args: Arguments) -> tuple[Run, Material]:
