@@ -59,10 +59,11 @@ def write_bytes(path: Path, content: bytes) -> None:
         draft.unlink(missing_ok=True)
 
 
-def write_runs(path: Path, table: RunTable) -> None:
-    """Write the columns of ``table`` to ``path`` (npz), atomically."""
+def write_runs(path: Path, table: RunTable, **others: np.ndarray) -> None:
+    """Write the columns of ``table``, and ``others``, to ``path`` (npz), atomically."""
     buffer = io.BytesIO()
-    np.savez_compressed(buffer, **table._asdict())
+    columns: dict[str, Any] = {**table._asdict(), **others}
+    np.savez_compressed(buffer, **columns)
     write_bytes(path, buffer.getvalue())
 
 
