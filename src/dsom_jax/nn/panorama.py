@@ -35,8 +35,8 @@ def finer_ranges(
 ) -> Array:
     """The same for a map of ``shape`` (H, W) at the network's scale, cast in the finer one that it is made of.
 
-    Resampled so that thin walls survive, a map has thicker walls and fewer gaps: at 1/3 m per cell 4 to 5 beams in ten of
-    real logs end more than 0.5 m behind the walls of their map, at 0.1 m one.
+    Resampled so that thin walls survive, a map has thicker walls and fewer gaps: at 1/3 m per cell 4 to 5 beams in ten
+    of real logs end more than 0.5 m behind the walls of their map, at 0.1 m one.
 
     Args:
         occupied: (h, w) cells of ``resolution`` metres with the same lower-left corner.

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from dsom_jax import plotting, report
-from dsom_jax.protocol.plan import SHIPPED, Plan, Variant, variants
+from dsom_jax.protocol.plan import Plan, Variant, variants
 from dsom_jax.protocol.running import read_traces
 from dsom_jax.run_table import RunTable, join, paired
 from dsom_jax.statistics import Evidence, corrected, rate_evidence, value_evidence
