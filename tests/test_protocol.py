@@ -22,8 +22,6 @@ from dsom_jax.protocol.plan import Plan, Variant, read_plan, variants
 ROOT = Path(__file__).resolve().parents[1]
 FILES = ("paper_data/upo.yaml", "paper_data/bicocca.yaml", "real/paper.yaml")
 CONFIGS = {name: ROOT / "experiments" / name for name in FILES}
-    name: ROOT / "experiments" / name for name in ("paper_data/upo.yaml", "paper_data/bicocca.yaml", "real/paper.yaml")
-}
 
 
 def test_every_method_gets_its_proposal_and_the_settings_of_the_map(monkeypatch):
