@@ -31,10 +31,17 @@ def load_map(path: str | Path, report: Report | None = None) -> OccupancyGrid:
     return load_drawing(path.parent / plan, override(Drawing(), fields, str(path)), report)
 
 
-def load_maps(paths: Sequence[Path], resolution: float) -> list[OccupancyGrid]:
-    """Maps at ``resolution`` metres per cell; UserError for one without free space."""
-    grids = [resample(load_map(path), resolution) for path in paths]
-    for path, grid in zip(paths, grids, strict=True):
+def load_maps(paths: Sequence[Path], resolution: float, finer: bool = False) -> list[OccupancyGrid]:
+    """Maps at ``resolution`` metres per cell; UserError for one without free space.
+
+    ``finer``: at their own resolution where it is finer, the finest of them for all.
+    """
+    given = [load_map(path) for path in paths]
+    coarse = [resample(grid, resolution) for grid in given]
+    for path, grid in zip(paths, coarse, strict=True):
         if not bool(grid.free.any()):
             raise UserError(f"{path}: no free cell at {resolution:.3f} m per cell; give a map with free space")
-    return grids
+    finest = min([resolution, *(grid.resolution for grid in given)])
+    if not finer or finest > resolution - 1e-4:
+        return coarse
+    return [grid if grid.resolution == finest else resample(grid, finest) for grid in given]
