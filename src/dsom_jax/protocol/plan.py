@@ -43,7 +43,7 @@ class Plan:
         on_map: share of a clip's reference that must lie on free cells.
         laser_max_range: metres; longer readings count as no return.
         adapt_minutes: of training on each map before it is used, where a method needs the network; 0 for none.
-        adapt_steps: of that training in place of minutes, so that it can be repeated on any machine; 0 goes by the clock.
+        adapt_steps: of that training in place of minutes, so that any machine does the same; 0 goes by the clock.
         adapt: fields of ``TrainConfig`` for that training that differ from those of :func:`.adapting.settings`.
     """
 
