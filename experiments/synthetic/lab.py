@@ -166,9 +166,17 @@ def write(path: Path, data: dict[str, Any]) -> None:
 
 
 def read(path: Path) -> dict[str, Any]:
-    """What :func:`write` wrote."""
-    found: dict[str, Any] = json.loads(path.read_text())
+    """What :func:`write` wrote; UserError for anything else."""
+    try:
+        found: dict[str, Any] = json.loads(path.read_text())
+    except (OSError, ValueError):
+        raise UserError(f"{path}: not a result of these experiments; delete it and run again") from None
     return found
+
+
+def result_path(folder: Path, piece: str, job: str) -> Path:
+    """Where the numbers of a job are kept."""
+    return folder / f"{piece}.{job.replace(' ', '_')}.json"
 
 
 def _rounded(data: Any) -> Any:

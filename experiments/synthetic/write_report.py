@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import verdicts
-from lab import Everything, Piece, Results, read
+from lab import Everything, Piece, Results, read, result_path
 from tables import markdown, number
 
 from dsom_jax import plotting
@@ -37,7 +37,7 @@ def gather(pieces: Sequence[Piece], folder: Path) -> dict[str, dict[str, Any]]:
     """The results of all jobs that there are, in the order of the pieces and their jobs."""
     found: dict[str, dict[str, Any]] = {}
     for piece in pieces:
-        paths = {job: folder / f"{piece.name}.{job.replace(' ', '_')}.json" for job in piece.jobs(piece.config)}
+        paths = {job: result_path(folder, piece.name, job) for job in piece.jobs(piece.config)}
         jobs = {job: read(path) for job, path in paths.items() if path.exists()}
         if jobs:
             found[piece.name] = jobs
