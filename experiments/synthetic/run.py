@@ -89,7 +89,8 @@ def run_piece(piece: Piece, lab: Lab, args: Args, folder: Path) -> list[str]:
         if args.only and not {piece.name, full} & set(args.only):
             continue
         if path.exists() and not args.force:
-            same = read(path)["made"]["config"] == report.plain(asdict(config))
+            made = read(path)["made"]
+            same = (made["config"], made["seed"]) == (report.plain(asdict(config)), lab.seed)
             print(f"{full}: kept" + ("" if same else ", made with other settings (--force)"), flush=True)
         elif not run_job(full, path, job, lab, config):
             failed.append(full)
