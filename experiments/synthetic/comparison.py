@@ -143,7 +143,8 @@ within 2 m and 10 deg; strict: last estimate within 0.5 m and 5 deg.
 ms/update: all runs together."""
 
 FIGURES = """\
-Paper's comparison (its Fig 6 and 7):
+Over time: mean over the runs of a sequence, shaded its 95 % bootstrap interval; below 2 m (and 10 deg) a run counts as
+converged. Paper's comparison (its Fig 6 and 7):
 
 ![Final position errors](FIGURES/comparison_e_pos.png)
 

@@ -35,6 +35,12 @@ from dsom_jax.types import Filter, Key, Proposal
 C = TypeVar("C")
 SCALED = ("runs", "worlds", "repeats")
 """Fields of configurations that ``--runs`` scales, in proportion to 100."""
+PROPOSALS = {
+    "dsom": ("DSOM", "#d62728"),
+    "likelihood_grid": ("likelihood grid", "#ff7f0e"),
+    "hybrid": ("hybrid", "#b5179e"),
+}
+"""Proposals that are compared: what figures call them, and their colours."""
 DIGITS = 6
 """Significant digits that are kept of every number."""
 

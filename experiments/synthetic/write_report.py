@@ -29,8 +29,7 @@ HEAD = """\
 Written by `python experiments/synthetic/run.py` from the shipped checkpoints; do not edit. The paper is Chen et al.,
 RA-L 2021; its numbers and where they stand are in [synthetic/paper.py](synthetic/paper.py). Real logs:
 [real/REPORT.md](real/REPORT.md). The paper's own real data (UPO, Bicocca) are not here and were not run
-([paper_data](paper_data/README.md)).
-"""
+([paper_data](paper_data/README.md))."""
 
 
 def gather(pieces: Sequence[Piece], folder: Path) -> dict[str, dict[str, Any]]:
