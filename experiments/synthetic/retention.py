@@ -67,7 +67,7 @@ def scene_of(lab: Lab, filter: Any, where: str, episode: Episode) -> Scene:
     """PM and trust at the truth, for every scan of a sequence."""
     grid = next(g for name, g, _ in lab.suite.episodes if name == where)
     found = quality.judge(filter.proposal, grid, episode.ranges, episode.poses)
-    scored = lab.build("adam_likelihood_grid", where, grid, episode)
+    scored = lab.build("mcl", where, grid, episode)  # Its weights are those of Alg 1.
     return Scene(np.asarray(found.mass), np.asarray(trusts(scored, episode.poses, episode.ranges)))
 
 
