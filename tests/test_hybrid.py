@@ -14,7 +14,7 @@ import tiny_world
 from dsom_jax import pose_grid as pg
 from dsom_jax.geometry import compose
 from dsom_jax.nn import DSOMConfig, create, evaluation_view
-from dsom_jax.occupancy import is_free
+from dsom_jax.occupancy import is_free, resample
 from dsom_jax.proposals.dsom import dsom
 from dsom_jax.proposals.hybrid import Hybrid, HybridConfig, interpolate_headings
 from dsom_jax.proposals.likelihood_grid import LikelihoodGridConfig, likelihood_grid
@@ -41,6 +41,24 @@ def parts():
 def scan():
     episode = tiny_world.drive()
     return Inputs(episode.ranges[3], jnp.zeros(3), jnp.int32(0))
+
+
+@pytest.mark.parametrize("panorama", [False, True])
+def test_a_network_takes_the_same_map_in_finer_cells(scan, panorama):
+    config = replace(NETWORK, resolution=0.5, panorama=panorama)
+    network = evaluation_view(create(config, seed=3))
+    grid = tiny_world.grid()
+    coarse = resample(grid, 0.5)
+    # Cut into quarters, the cells of the coarse map are what it is resampled from, and what is seen from where.
+    fine = replace(
+        coarse, occupied=coarse.occupied.repeat(2, 0).repeat(2, 1), free=coarse.free.repeat(2, 0).repeat(2, 1)
+    )
+    fine = replace(fine, resolution=0.25)
+    whole, cut = (prepare(dsom(network, shown, LIDAR), scan) for shown in (coarse, fine))
+    np.testing.assert_allclose(shares(cut), shares(whole), atol=1e-6)
+    # The map itself has thinner walls than its coarse picture.
+    other = prepare(dsom(network, grid, LIDAR), scan)
+    assert (np.abs(shares(other) - shares(whole)).max() > 1e-6) == panorama
 
 
 def shares(pm):

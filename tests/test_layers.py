@@ -18,7 +18,7 @@ LAYERS = (
     ("proposals", "metrics", "statistics", "run_table"),
     ("filters", "training", "montecarlo"),
     ("atomic", "data", "checkpoint", "run_folder", "trained", "plotting", "report", "judging"),
-    ("cli", "trainer", "train", "train_filter", "bench", "localize", "evaluate"),
+    ("cli", "trainer", "train", "train_filter", "bench", "localize", "evaluate", "protocol"),
 )
 DEVICE = 5
 """Layers below this are device code."""

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dsom_jax.nn import DSOMConfig
-from dsom_jax.nn.panorama import PanoramaEncoder, expected_ranges, view_features
+from dsom_jax.nn.panorama import PanoramaEncoder, expected_ranges, finer_ranges, view_features
 from dsom_jax.nn.polar import bin_centres
 from reference import rays
 
@@ -34,6 +34,27 @@ def test_views_are_means_of_the_slow_casters_ranges():
         np.testing.assert_allclose(views[i, j, :, NO_RETURN], (~returned).reshape(8, 4).mean(1), atol=1e-6)
         distance = np.minimum(reach, CONFIG.range_max).reshape(8, 4).mean(1) / CONFIG.range_max
         np.testing.assert_allclose(views[i, j, :, DISTANCE], distance, atol=1e-4)
+
+
+def test_views_of_a_finer_map_are_the_slow_casters_in_it():
+    fine = np.zeros((80, 80), bool)
+    fine[[0, 79]] = fine[:, [0, 79]] = True
+    fine[22:24, 30:61] = True
+    fine[22:24, 44:47] = False  # a gap of 0.3 m, which maps of 0.5 m cells close
+    surface = 0.05
+    views = np.asarray(finer_ranges(jnp.asarray(fine), CONFIG, (16, 16), 0.1, surface))
+    assert views.shape == (8, 8, CONFIG.angular_bins)
+    angles = np.asarray(bin_centres(CONFIG.angular_bins), np.float64)
+    for i, j in [(3, 3), (5, 2), (2, 4), (1, 4)]:
+        reach = np.array([rays.cast(fine, 10 * j + 5.0, 10 * i + 5.0, angle)[0] for angle in angles]) * 0.1 + surface
+        np.testing.assert_allclose(views[i, j], np.where(reach < CONFIG.range_max, reach, np.inf), atol=1e-4)
+
+
+def test_cells_cut_into_smaller_ones_are_the_same_map():
+    fine = ROOM.repeat(4, 0).repeat(4, 1)
+    views = finer_ranges(jnp.asarray(fine), CONFIG, ROOM.shape, CONFIG.resolution / 4)
+    # Those inside of walls are at distance zero either way.
+    np.testing.assert_allclose(views, expected_ranges(jnp.asarray(ROOM), CONFIG), atol=1e-4)
 
 
 def test_turning_the_map_turns_the_views():

@@ -9,9 +9,7 @@ import importlib.util
 import json
 import math
 import sys
-from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import ezdxf
@@ -20,14 +18,14 @@ import numpy as np
 import pytest
 import yaml
 
-from dsom_jax import localize, train
-from dsom_jax.cli import parse
+from dsom_jax import localize
 from dsom_jax.data import load_map, save_ros_map, save_tum, se2
 from dsom_jax.errors import UserError, run_cli
-from dsom_jax.filters.methods import DRAWN, REAL
+from dsom_jax.filters.methods import REAL
 from dsom_jax.lidar import LidarConfig
+from dsom_jax.protocol import command
+from dsom_jax.protocol.running import read_traces
 from dsom_jax.raycast import RaycastConfig, cast_rays, make_tables
-from dsom_jax.report import read_runs
 from fixtures.make_bag import write_bag
 from tiny_log import UPDATES, path
 
@@ -166,21 +164,14 @@ def test_bad_input_is_one_line(bicocca, upo, monkeypatch, tmp_path, capfd, words
 def small(name: str, tmp_path: Path, **changes: Any) -> Path:
     """A shipped configuration, cut down."""
     plan = yaml.safe_load((FOLDER / f"{name}.yaml").read_text())
-    plan |= {"runs": 2, "particles": 40, "updates": 8, "adapt_minutes": 0, **changes}
+    plan |= {"runs": 2, "particles": 40, "updates": 8, "adapt_minutes": 0, "shown": [], **changes}
     file = tmp_path / f"{name}.yaml"
     file.write_text(yaml.safe_dump(plan))
     return file
 
 
-def check_results(folder: Path, methods: list[str], particles: int = 40) -> dict[str, Any]:
-    data = json.loads((folder / "bench.json").read_text())
-    assert list(data["methods"]) == methods and (data["runs"], data["particles"]) == (2, particles)
-    for entry in data["methods"].values():
-        assert entry["global"]["experiments"] == entry["kidnap"]["experiments"] == 6
-    table = read_runs(folder / "runs.npz")
-    assert len(table.run) == 2 * len(methods) * 3 * 2
-    assert (folder / "error_evolution.png").is_file() and (folder / "bench.md").is_file()
-    return data
+def call_script(config: Path, data: Path, folder: Path) -> None:
+    script.main(script.Args(config, data, folder / "out", folder / "work"))
 
 
 def test_bicocca_in_two_parts(bicocca, tmp_path, monkeypatch):
@@ -189,15 +180,13 @@ def test_bicocca_in_two_parts(bicocca, tmp_path, monkeypatch):
     boxes = {"part-1": [0, 0.5, 7, 6], "part-2": [1, 1, 7, 6]}
     maps = {name: fields | {"pose": list(POSE), "box": boxes[name], "sight": 0.5} for name, fields in maps.items()}
     suites = []
-    monkeypatch.setattr(script, "run_map", lambda plan, suite, network, folder: suites.append((suite, network, folder)))
-    script.main(script.Args(small("bicocca", tmp_path, maps=maps, methods=["mcl"]), bicocca, tmp_path / "out"))
-    assert [(s.name, network, folder.name) for s, network, folder in suites] == [
-        ("bicocca, part-1", None, "part-1"), ("bicocca, part-2", None, "part-2"),
-    ]  # fmt: skip
-    sizes = [suite.episodes[0][1].size for suite, _, _ in suites]
+    monkeypatch.setattr(command, "run_map", lambda plan, suite, *others: suites.append(suite))
+    call_script(small("bicocca", tmp_path, maps=maps, methods=["mcl"]), bicocca, tmp_path)
+    assert [suite.name for suite in suites] == ["bicocca, part-1", "bicocca, part-2"]
+    sizes = [suite.episodes[0][1].size for suite in suites]
     # The drawing is 7 m x 6 m, with three cells around it: where the box ends inside of it, half a metre more.
     assert sizes[0] == pytest.approx((7.7, 6.2), abs=0.25) and sizes[1] == pytest.approx((6.75, 5.75), abs=0.25)
-    for suite, _, _ in suites:
+    for suite in suites:
         for _, _, episode in suite.episodes:
             assert episode.ranges.shape == (16, 181) and np.flatnonzero(episode.kidnapped).tolist() == [8]
             assert np.isfinite(episode.poses).all() and suite.lidar.mount == (0.08, 0.0, 0.0)
@@ -207,47 +196,39 @@ def test_bicocca_in_two_parts(bicocca, tmp_path, monkeypatch):
         np.testing.assert_allclose(ends[2][8:], ends[0][:8], atol=1e-6)
 
 
-def test_upo_from_a_bag(upo, tmp_path):
+def test_upo_from_a_bag(upo, tmp_path, capsys):
     fields = yaml.safe_load((upo / "map.yaml").read_text())
-    config = small("upo", tmp_path, maps={"alcazar": fields}, logs=["*.bag"], methods=["mcl"])
-    script.main(script.Args(config, upo, tmp_path / "out"))
-    data = json.loads((tmp_path / "out" / "alcazar" / "bench.json").read_text())
-    assert list(data["methods"]) == ["mcl"] and (data["runs"], data["particles"], data["t_cut"]) == (2, 40, 0.6)
-    for phase in ("global", "kidnap"):
-        assert data["methods"]["mcl"][phase]["experiments"] == 6
-    assert len(read_runs(tmp_path / "out" / "alcazar" / "runs.npz").run) == 2 * 3 * 2
-    assert {"error_evolution.png", "bench.md"} <= {p.name for p in (tmp_path / "out" / "alcazar").iterdir()}
-
-
-def test_every_method_gets_its_proposal_and_the_settings_of_the_map(monkeypatch, tmp_path):
-    plan = script.Plan(
-        methods=("mixture_mcl", "mixture_mcl_star", "adam_dsom"), map_kind="drawn", particles=7, t_cut=0.5
+    methods = ["mcl", "adam_likelihood_grid", "robust_likelihood_grid"]
+    changes: dict[str, Any] = {"maps": {"alcazar": fields}, "logs": ["*.bag"], "methods": methods, "t_cuts": [0.6, 0.5]}
+    config = small("upo", tmp_path, **changes)
+    call_script(config, upo, tmp_path)
+    out, work = tmp_path / "out" / "upo" / "alcazar", tmp_path / "work" / "upo" / "alcazar"
+    stems = ["mcl", "adam_likelihood_grid-0.6", "adam_likelihood_grid-0.5", "robust_likelihood_grid"]
+    for stem in stems:
+        data = json.loads((out / f"{stem}.json").read_text())
+        assert (data["runs"], data["particles"], data["updates"]) == (2, 40, 8)
+        assert data["global"]["experiments"] == data["kidnap"]["experiments"] == 6
+        table, errors = read_traces(work / f"{stem}.npz")
+        assert len(table.run) == 2 * 3 * 2 and errors.shape == (3, 2, 16) and set(table.method) == {stem}
+        assert (work / f"{stem}.png").is_file()
+    assert {f"{name}.{ending}" for name in ("error_evolution", "position_error") for ending in ("png", "pdf")} <= {
+        path.name for path in out.iterdir()
+    }
+    text = (tmp_path / "out" / "upo" / "REPORT.md").read_text()
+    assert (
+        text.count("| `adam_likelihood_grid` |  | 0.5 |") == 2
+        and "`robust_likelihood_grid`, `adam_likelihood_grid-0.6`" in text
     )
-    suite = SimpleNamespace(lidar="lidar", episodes=(("m", "grid", "episode"),))
-    made: list[Any] = []
-    monkeypatch.setattr(script, "make_proposal", lambda name, grid, lidar, settings, net: (name, net))
-    monkeypatch.setattr(script, "with_episode", lambda proposal, episode: (*proposal, episode))
-    monkeypatch.setattr(script, "make_filter", lambda *words: made.append(words))
-    monkeypatch.setattr(
-        script.bench, "run_method", lambda name, suite, keys, build, bar: build(name, *suite.episodes[0])
-    )
-    monkeypatch.setattr(script.bench, "summary", lambda *_: {}["enough"])
-    with pytest.raises(KeyError, match="enough"):
-        script.run_map(plan, suite, "network", tmp_path)
-    assert [words[:2] for words in made] == [
-        ("mixture_mcl", ("dual_features", "network")), ("mixture_mcl", ("dual_features", "network", "episode")),
-        ("adam", ("dsom", "network")),
+    # What exists is kept; what was made otherwise is made again.
+    made = {stem: (out / f"{stem}.json").stat().st_mtime_ns for stem in stems}
+    data = json.loads((out / "mcl.json").read_text())
+    (out / "mcl.json").write_text(json.dumps(data | {"runs": 3}))
+    capsys.readouterr()
+    call_script(config, upo, tmp_path)
+    assert [line.split(": ")[1] for line in capsys.readouterr().out.splitlines() if line.startswith("alcazar")] == [
+        "done", "kept", "kept", "kept",
     ]  # fmt: skip
-    assert all((w[4].particles, w[4].t_cut, w[4].robust) == (7, 0.5, DRAWN.robust) for w in made)
-
-
-@pytest.mark.parametrize("name", ["upo", "bicocca"])
-def test_shipped_configurations_are_the_papers(name):
-    plan = script.read_plan(SimpleNamespace(config=FOLDER / f"{name}.yaml", runs=None, adapt_minutes=None))
-    assert (plan.particles, plan.runs, plan.clips) == (500, 100, 3)
-    assert plan.t_cut == {"upo": 0.6, "bicocca": 0.5}[name]
-    assert plan.map_kind == {"upo": "scanned", "bicocca": "drawn"}[name]
-    assert len(plan.maps) == {"upo": 1, "bicocca": 2}[name]
+    assert {stem: (out / f"{stem}.json").stat().st_mtime_ns for stem in stems[1:]} == {s: made[s] for s in stems[1:]}
 
 
 def test_the_pose_of_the_drawing_undoes_the_authors_transform():
@@ -256,28 +237,16 @@ def test_the_pose_of_the_drawing_undoes_the_authors_transform():
     np.testing.assert_allclose(se2.compose(np.array(fields["pose"]), into_drawing), 0.0, atol=1e-5)
 
 
-def test_training_is_called_with_words_that_it_knows(monkeypatch, tmp_path):
-    called: list[list[str]] = []
-    monkeypatch.setattr(script.subprocess, "run", lambda words: called.append(words) or SimpleNamespace(returncode=0))
-    plan = script.Plan(adapt_minutes=12.0, methods=("mcl", "adam_dsom"))
-    folder = script.network_for(plan, tmp_path / "map.yaml", tmp_path / "start", tmp_path / "net")
-    monkeypatch.setattr(sys, "argv", called[0][2:])
-    arguments = parse(train.Arguments, "python -m dsom_jax.train")
-    assert folder == arguments.out == tmp_path / "net" and arguments.init == tmp_path / "start"
-    assert arguments.maps == (tmp_path / "map.yaml",) and arguments.minutes == 12.0
-    assert script.network_for(replace(plan, adapt_minutes=0.0), Path("m"), Path("start"), tmp_path) == Path("start")
-    assert script.network_for(script.Plan(methods=("mcl",)), Path("m"), None, tmp_path) is None
-    monkeypatch.setattr(script.subprocess, "run", lambda words: SimpleNamespace(returncode=2))
-    with pytest.raises(UserError, match=r"training on map.yaml failed"):
-        script.network_for(plan, tmp_path / "map.yaml", tmp_path / "start", tmp_path / "net")
-
-
 @pytest.mark.parametrize(
     ("changes", "fragments"),
     [
         ({"logs": ["*.bog"]}, ["holds nothing like *.bog", "README"]),
         ({"methods": ["magic"]}, ["upo.yaml", "magic"]),
         ({"clips": 1}, ["upo.yaml", "at least 2"]),
+        ({"methods": ["mcl@shipped"]}, ["upo.yaml", "mcl@shipped"]),
+        ({"shown": ["adam_dsom"]}, ["upo.yaml", "adam_dsom"]),
+        ({"t_cuts": [1.5]}, ["upo.yaml", "t_cuts between 0 and 1"]),
+        ({"map_kind": "guessed"}, ["upo.yaml", "alcazar needs logs"]),
         ({"speed": 1}, ["upo.yaml", "unknown field speed"]),
         ({"updates": 43}, ["alcazar", "clips of 43 updates", "3 are wanted"]),
         ({"maps": {"alcazar": {"image": "gone.pgm"}}}, ["alcazar.yaml", "'resolution'"]),
@@ -288,7 +257,7 @@ def test_spoilt_configurations(upo, tmp_path, changes, fragments):
     fields = yaml.safe_load((upo / "map.yaml").read_text())
     config = small("upo", tmp_path, **{"maps": {"alcazar": fields}, "logs": ["*.bag"], "methods": ["mcl"], **changes})
     with pytest.raises(UserError) as error:
-        script.main(script.Args(config, upo, tmp_path / "out"))
+        call_script(config, upo, tmp_path)
     assert all(fragment in str(error.value) for fragment in fragments), error.value
     # Nothing is written before the configuration and the logs are known to be good.
     assert (tmp_path / "out").exists() == ("maps" in changes or "updates" in changes)

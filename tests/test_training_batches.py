@@ -10,19 +10,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from dsom_jax.nn import DSOMConfig
+from dsom_jax.nn.panorama import finer_ranges
 from dsom_jax.occupancy import from_cells
+from dsom_jax.raycast import RaycastConfig, cast_rays, make_tables
 from dsom_jax.simulate.worlds import WorldConfig
-from dsom_jax.training.batches import (
-    PLAIN,
+from dsom_jax.training.batches import PLAIN, ScanConfig, disturbed, make_batch, misplace, spoil_scan
+from dsom_jax.training.buildings import (
     Building,
-    ScanConfig,
+    crop_side,
     crop_source,
-    make_batch,
     make_pool,
     mixed_source,
     procedural_source,
     random_poses,
-    spoil_scan,
     turned,
 )
 from dsom_jax.training.evaluation import score_map, summarise
@@ -52,6 +53,50 @@ def test_batch_from_given_maps():
     jax.tree.map(np.testing.assert_array_equal, batch, again)
 
 
+def test_fine_maps_are_shown_coarse_and_cast_fine():
+    """The room of 0.5 m cells, its cells cut into 5 x 5: a crop shows it as it is and casts scans and views in it."""
+    fine = ROOM.repeat(5, 0).repeat(5, 1)
+    # A gap of 0.1 m in the lower wall, which no coarse cell shows.
+    fine = fine.at[0:5, 100].set(False)
+    model = DSOMConfig(width=2, headings=8, channels=2, panorama=True, resolution=0.5, range_max=30.0)
+    side = crop_side(40, 0.5, 0.1)
+    pool = make_pool([from_cells(fine, resolution=0.1)], side)
+    scans = replace(PLAIN, beams=90, obstacles=(0, 0), sigma=0.0, range_max=30.0)
+    source = crop_source(pool, 40, 0.5, 0.1)
+    batch = jax.jit(lambda k: make_batch(k, source, scans, 2, 8, model))(jax.random.key(1))
+    assert side == 200 and batch.occupied.shape == (2, 40, 40) and batch.views.shape == (2, 20, 20, 32)
+    i, j = (np.floor(np.asarray(batch.poses[..., axis]) / 0.5).astype(int) for axis in (1, 0))
+    assert np.asarray(batch.free)[np.arange(2)[:, None], i, j].all()
+    for shown, free in zip(batch.occupied, batch.free, strict=True):
+        assert not (shown & free).any()
+    # Views and scans of a crop, turned or not, are those of the fine crop that it was made from.
+    keys = [jax.random.split(key)[0] for key in jax.random.split(jax.random.key(1), 2)]
+    for n, key in enumerate(keys):
+        building = source(key)
+        assert building.given.shape == (200, 200) and building.given.resolution == 0.1
+        np.testing.assert_array_equal(building.shown.occupied, batch.occupied[n])
+        np.testing.assert_array_equal(batch.views[n], finer_ranges(building.given.occupied, model, (40, 40), 0.1))
+        tables = make_tables(building.given, RaycastConfig("exact"), 30.0)
+        # The coarse wall closes the gap and is up to a cell nearer.
+        np.testing.assert_allclose(batch.ranges[n], cast_rays(tables, batch.poses[n], scans.lidar), atol=1e-3)
+
+
+def test_disturbances_of_floor_plans():
+    config = replace(PLAIN, removed=(40, 40), obstacles=(0, 0))
+    grid = from_cells(ROOM, resolution=0.5)
+    keys = jax.random.split(jax.random.key(0))
+    spoilt = disturbed(keys, grid, config)
+    assert (spoilt.occupied <= grid.occupied).all() and spoilt.occupied.sum() < grid.occupied.sum()
+    jax.tree.map(np.testing.assert_array_equal, disturbed(keys, grid, replace(config, removed=(0, 0))), grid)
+    shifts = np.stack([misplace(key, jnp.full(360, 9.0), 0.3) - 9 for key in jax.random.split(jax.random.key(1), 300)])
+    # At its own bearings a shift has the variance asked for, 360 / 24 beams apart it is another one.
+    at = shifts[:, ::15]
+    assert abs(at.std() - 0.3) < 5 * 0.3 / math.sqrt(2 * at.size)
+    assert abs((at[:, 1:] * at[:, :-1]).mean()) < 5 * 0.09 / math.sqrt(at.size)
+    assert np.abs(np.diff(shifts, axis=1)).max() < 0.3 * 10 / 15
+    assert (misplace(jax.random.key(2), jnp.full(360, 0.1), 1.0) >= 0).all()
+
+
 def test_spoiled_scans_keep_to_their_conditions():
     config = ScanConfig(beams=60, limited=1.0, fov_min=math.pi, reach_min=4.0, thinning=3, dropout=0.2, short=0.2)
     clean = jnp.linspace(0.5, 12.0, 60)
@@ -70,10 +115,10 @@ def test_plain_scans_are_whole():
 
 def test_floor_plans_show_part_of_what_the_lidar_sees():
     world = WorldConfig(cells=48)
-    shown, seen = jax.jit(procedural_source(world, bare=1.0))(jax.random.key(3))
+    shown, seen, _ = jax.jit(procedural_source(world, bare=1.0))(jax.random.key(3))
     assert shown.occupied.sum() < seen.occupied.sum()
     assert not (seen.free & ~shown.free).any()
-    shown, seen = jax.jit(procedural_source(world, bare=0.0))(jax.random.key(3))
+    shown, seen, _ = jax.jit(procedural_source(world, bare=0.0))(jax.random.key(3))
     jax.tree.map(np.testing.assert_array_equal, shown, seen)
 
 

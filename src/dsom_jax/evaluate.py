@@ -17,13 +17,13 @@ from rich.table import Table
 
 from dsom_jax import checkpoint, plotting, report
 from dsom_jax.cli import parse
-from dsom_jax.data import load_map
+from dsom_jax.data.open_map import load_maps
 from dsom_jax.errors import UserError, run_cli
 from dsom_jax.filters.methods import Settings, make_proposal
 from dsom_jax.geometry import transform_points
 from dsom_jax.lidar import LidarConfig, scan_points
 from dsom_jax.nn import DSOM
-from dsom_jax.occupancy import OccupancyGrid, resample
+from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.simulate.worlds import WorldConfig, make_world
 from dsom_jax.training import quality
 from dsom_jax.training.batches import PLAIN, ScanConfig, make_scans
@@ -122,10 +122,7 @@ def new_worlds(args: Args, network: DSOM) -> list[tuple[Key, OccupancyGrid]]:
 
 def given_maps(args: Args, network: DSOM) -> list[tuple[Key, OccupancyGrid]]:
     """Maps at the network's scale and the keys of their scans."""
-    grids = [resample(load_map(path), network.config.resolution) for path in args.maps]
-    for path, grid in zip(args.maps, grids, strict=True):
-        if not bool(grid.free.any()):
-            raise UserError(f"{path}: no free cell at {network.config.resolution:.3f} m per cell; give another map")
+    grids = load_maps(args.maps, network.config.resolution)
     root = jax.random.fold_in(jax.random.key(args.seed), _UNSEEN)
     return list(zip(jax.random.split(root, len(grids)), grids, strict=True))
 

@@ -49,10 +49,11 @@ def write_text(path: Path, text: str) -> None:
     write_atomic(path, text.encode())
 
 
-def write_runs(path: Path, table: RunTable) -> None:
-    """Write the columns of ``table`` to ``path`` (npz), atomically."""
+def write_runs(path: Path, table: RunTable, **others: np.ndarray) -> None:
+    """Write the columns of ``table``, and ``others``, to ``path`` (npz), atomically."""
     buffer = io.BytesIO()
-    np.savez_compressed(buffer, **table._asdict())
+    columns: dict[str, Any] = {**table._asdict(), **others}
+    np.savez_compressed(buffer, **columns)
     write_atomic(path, buffer.getvalue())
 
 

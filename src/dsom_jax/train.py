@@ -10,9 +10,10 @@ import jax
 
 from dsom_jax import checkpoint
 from dsom_jax.cli import parse
+from dsom_jax.data.open_map import load_maps
 from dsom_jax.errors import UserError, run_cli
 from dsom_jax.nn import DSOM
-from dsom_jax.occupancy import OccupancyGrid, resample
+from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.run_folder import Run, check_new, create, read_yaml, reopen
 from dsom_jax.trainer import Parts, check_length, train
 from dsom_jax.training.batches import make_batch, plain
@@ -72,17 +73,6 @@ def read_config(path: Path | None) -> TrainConfig:
     return override(TrainConfig(), read_yaml(path), str(path))
 
 
-def load_maps(paths: tuple[Path, ...], resolution: float) -> list[OccupancyGrid]:
-    """Maps at the network's resolution, each with free space."""
-    from dsom_jax.data.open_map import load_map
-
-    grids = [resample(load_map(path), resolution) for path in paths]
-    for path, grid in zip(paths, grids, strict=True):
-        if not bool(grid.free.any()):
-            raise UserError(f"{path}: no free cell at {resolution:.3f} m per cell; give a map with free space")
-    return grids
-
-
 def open_run(args: Arguments) -> tuple[Run, Material]:
     """A new run in an empty folder, or the one to resume, and what it is made of."""
     path = args.out / "run.json"
@@ -101,7 +91,9 @@ def open_run(args: Arguments) -> tuple[Run, Material]:
 def read_material(args: Arguments, run: Run) -> Material:
     """Maps and network; a run that has saved a state no longer needs the network that it began with."""
     network = None if run.states() else load_init(args.init, run.config)
-    return Material(load_maps(tuple(map(Path, run.maps)), run.config.model.resolution), network)
+    # Procedural buildings have the network's scale, and so do maps that are mixed with them.
+    alone = run.config.maps_share == 1.0
+    return Material(load_maps(tuple(map(Path, run.maps)), run.config.model.resolution, alone), network)
 
 
 def resume_run(args: Arguments, path: Path) -> Run:
@@ -135,9 +127,11 @@ def load_init(path: Path | None, config: TrainConfig) -> DSOM | None:
     if path is None:
         return None
     model: DSOM = checkpoint.load(path)
-    if model.config != config.model:
-        pairs = [(f.name, getattr(model.config, f.name), getattr(config.model, f.name)) for f in fields(config.model)]
-        unlike = ", ".join(f"{name} = {own!r}, the run's is {wanted!r}" for name, own, wanted in pairs if own != wanted)
+    # What scans it was trained for is no part of its structure: the run trains it for those that it draws.
+    names = [f.name for f in fields(config.model) if f.name not in ("fov_min", "reach_min")]
+    pairs = [(name, getattr(model.config, name), getattr(config.model, name)) for name in names]
+    unlike = ", ".join(f"{name} = {own!r}, the run's is {wanted!r}" for name, own, wanted in pairs if own != wanted)
+    if unlike:
         raise UserError(f"{path}: field model: {unlike}; give a --config with the network's own, or another --init")
     return model
 
@@ -147,7 +141,7 @@ def held_out(run: Run, grids: list[OccupancyGrid]) -> Any:
     scans = plain(run.config.scan)
     source = world_source(replace(run.config, scan=scans), run.config.late, grids)
     key = jax.random.key(2**31 - 1 - run.config.seed)
-    batch = jax.jit(lambda k: make_batch(k, source, scans, 12, 8))(key)
+    batch = jax.jit(lambda k: make_batch(k, source, scans, 12, 8, run.config.model))(key)
     return make_evaluation(batch, scans.lidar)
 
 

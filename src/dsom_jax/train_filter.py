@@ -12,12 +12,12 @@ import jax.numpy as jnp
 
 from dsom_jax import checkpoint
 from dsom_jax.cli import parse
+from dsom_jax.data.open_map import load_maps
 from dsom_jax.data.suite import load_suite
 from dsom_jax.errors import UserError, run_cli
 from dsom_jax.nn import KINDS
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.run_folder import FilterRun, Run, check_new, create, read_yaml, reopen
-from dsom_jax.train import load_maps
 from dsom_jax.trainer import Parts, check_length, train
 from dsom_jax.training.filter_evaluation import make_tracking
 from dsom_jax.training.filter_loop import FilterTrainConfig, init_filter_state, make_filter_step, stack_maps

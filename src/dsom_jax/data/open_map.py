@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from dsom_jax.data.dxf import Drawing, load_drawing
@@ -9,7 +10,7 @@ from dsom_jax.data.files import read_yaml
 from dsom_jax.data.log import Report
 from dsom_jax.data.ros_map import load_ros_map
 from dsom_jax.errors import UserError
-from dsom_jax.occupancy import OccupancyGrid
+from dsom_jax.occupancy import OccupancyGrid, resample
 from dsom_jax.training.options import override
 
 
@@ -28,3 +29,19 @@ def load_map(path: str | Path, report: Report | None = None) -> OccupancyGrid:
     if not isinstance(plan, str):
         raise UserError(f"{path}: drawing = {plan!r}: must be the name of a DXF file")
     return load_drawing(path.parent / plan, override(Drawing(), fields, str(path)), report)
+
+
+def load_maps(paths: Sequence[Path], resolution: float, finer: bool = False) -> list[OccupancyGrid]:
+    """Maps at ``resolution`` metres per cell; UserError for one without free space.
+
+    ``finer``: at their own resolution where it is finer, the finest of them for all.
+    """
+    given = [load_map(path) for path in paths]
+    coarse = [resample(grid, resolution) for grid in given]
+    for path, grid in zip(paths, coarse, strict=True):
+        if not bool(grid.free.any()):
+            raise UserError(f"{path}: no free cell at {resolution:.3f} m per cell; give a map with free space")
+    finest = min([resolution, *(grid.resolution for grid in given)])
+    if not finer or finest > resolution - 1e-4:
+        return coarse
+    return [grid if grid.resolution == finest else resample(grid, finest) for grid in given]

@@ -176,7 +176,7 @@ def make_proposal(
         model = replace(settings.grid.model, range_max=lidar.range_max)
         return likelihood_grid(grid, lidar, replace(settings.grid, model=model))
     if name == "dsom":
-        return dsom(checkpoint, grid, lidar, settings.sharpness)
+        return dsom(checkpoint, grid, lidar, settings.sharpness, settings.raycast.surface)
     if name == "hybrid":
         have = made or {}
         parts = (have.get(p) or make_proposal(p, grid, lidar, settings, checkpoint) for p in PARTS[name])

@@ -65,10 +65,17 @@ class DSOM(nnx.Module):
         ranges = jnp.where(ranges < limit, ranges, jnp.inf)
         return scan_image(ranges, lidar, self.config.resolution, self.config.scan_size)
 
-    def encode(self, occupied: Array, free: Array) -> MapFeatures:
-        """Features of maps (N, H, W), H and W multiples of 8: Eq 2, and the panorama."""
+    def encode(self, occupied: Array, free: Array, views: Array | None = None) -> MapFeatures:
+        """Features of maps (N, H, W), H and W multiples of 8: Eq 2, and the panorama.
+
+        ``views`` (N, H/2, W/2, A): expected ranges of maps that were finer, in place of those of ``occupied``.
+        """
         features, indices = self.environment(occupied)
-        return MapFeatures(features, indices, None if self.panorama is None else self.panorama(occupied), free)
+        if self.panorama is None:
+            return MapFeatures(features, indices, None, free)
+        return MapFeatures(
+            features, indices, self.panorama(occupied) if views is None else self.panorama.encode(views), free
+        )
 
     def similarity(self, maps: MapFeatures, observations: Array) -> Similarity:
         """Eq 1 and 3, sharpened, for N maps and observations (N, S, ...)."""
@@ -86,9 +93,9 @@ class DSOM(nnx.Module):
         similarity = self.similarity(maps, observations)
         return Outputs(self.decoder(similarity, maps.indices), similarity)
 
-    def __call__(self, occupied: Array, observations: Array) -> Outputs:
-        """Maps (N, H, W), H and W multiples of 8, with observations (N, S, ...)."""
-        return self.decode(self.encode(occupied, ~occupied.astype(bool)), observations)
+    def __call__(self, occupied: Array, observations: Array, views: Array | None = None) -> Outputs:
+        """Maps (N, H, W), H and W multiples of 8, with observations (N, S, ...); ``views`` as for :meth:`encode`."""
+        return self.decode(self.encode(occupied, ~occupied.astype(bool), views), observations)
 
 
 def create(config: DSOMConfig, seed: int = 0) -> DSOM:
@@ -101,16 +108,19 @@ def evaluation_view(model: DSOM) -> DSOM:
     return nnx.view(model, use_running_average=True)
 
 
-def encode_map(model: DSOM, occupied: Array, free: Array | None = None) -> MapFeatures:
+def encode_map(model: DSOM, occupied: Array, free: Array | None = None, views: Array | None = None) -> MapFeatures:
     """Environment features of one map at the network's resolution.
 
     Args:
         model: an evaluation view.
         occupied: (H, W) bool, cells that stop rays; any H and W.
         free: (H, W) bool, where the robot may stand; all that is not occupied if not given.
+        views: (H'/2, W'/2, A) expected ranges of a finer map (:func:`dsom_jax.nn.panorama.finer_ranges`), H' and W'
+            padded to multiples of 8.
     """
     free = ~occupied.astype(bool) if free is None else free
-    return jax.tree.map(lambda x: x[0], model.encode(pad_to_multiple(occupied)[None], free[None]))
+    views = None if views is None else views[None]
+    return jax.tree.map(lambda x: x[0], model.encode(pad_to_multiple(occupied)[None], free[None], views))
 
 
 def masked_log_softmax(logits: Array, free: Array) -> Array:

@@ -11,7 +11,8 @@ from flax import nnx
 
 from dsom_jax import pose_grid as pg
 from dsom_jax.lidar import LidarConfig
-from dsom_jax.nn import DSOM, MapFeatures, encode_map, log_probability_map
+from dsom_jax.nn import DSOM, DSOMConfig, MapFeatures, encode_map, log_probability_map
+from dsom_jax.nn.panorama import finer_ranges
 from dsom_jax.occupancy import OccupancyGrid, resample
 from dsom_jax.types import Array, Inputs, Key
 
@@ -55,15 +56,31 @@ class DSOMProposal:
         return pg.sample(key, prepared, n)
 
 
-def dsom(model: DSOM, grid: OccupancyGrid, lidar: LidarConfig, sharpness: float = 1.0) -> DSOMProposal:
-    """Proposal of an evaluation view of a network, on a map resampled to its scale; ``sharpness`` is an exponent."""
-    scaled = grid if abs(grid.resolution - model.config.resolution) < 1e-4 else resample(grid, model.config.resolution)
+def dsom(
+    model: DSOM, grid: OccupancyGrid, lidar: LidarConfig, sharpness: float = 1.0, surface: float = 0.0
+) -> DSOMProposal:
+    """Proposal of an evaluation view of a network, on a map resampled to its scale; ``sharpness`` is an exponent.
+
+    What is seen from where is cast in the map as it was given; ``surface``: how deep in its occupied cells beams end.
+    """
+    same = abs(grid.resolution - model.config.resolution) < 1e-4
+    scaled = grid if same else resample(grid, model.config.resolution)
     graph, weights = nnx.split(model)
     weights = nnx.as_pure(weights)
-    features = _features(graph, weights, scaled)
+    views = None if same and not surface else _views(grid, model.config, scaled.shape, surface)
+    features = _features(graph, weights, scaled, views)
     return DSOMProposal(weights, features, pg.over(scaled, model.config.headings), graph, lidar, sharpness)
 
 
+@partial(jax.jit, static_argnames=("config", "shape"))
+def _views(grid: OccupancyGrid, config: DSOMConfig, shape: tuple[int, int], surface: float) -> Array | None:
+    """Expected ranges for a network that compares views, from every second of ``shape`` cells and their padding."""
+    if not config.panorama:
+        return None
+    height, width = (side + -side % 8 for side in shape)
+    return finer_ranges(grid.occupied, config, (height, width), grid.resolution, surface * grid.resolution)
+
+
 @partial(jax.jit, static_argnames="graph")
-def _features(graph: Any, weights: Any, grid: OccupancyGrid) -> MapFeatures:
-    return encode_map(nnx.merge(graph, weights), grid.occupied, grid.free)
+def _features(graph: Any, weights: Any, grid: OccupancyGrid, views: Array | None) -> MapFeatures:
+    return encode_map(nnx.merge(graph, weights), grid.occupied, grid.free, views)

@@ -3,34 +3,25 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from dsom_jax import checks
 from dsom_jax.lidar import LidarConfig, LidarNoise, observe
+from dsom_jax.nn.config import DSOMConfig
+from dsom_jax.nn.panorama import finer_ranges
 from dsom_jax.nn.polar import Conditions
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.raycast import RaycastConfig, cast_rays, make_tables
-from dsom_jax.simulate.obstacles import add_obstacles
-from dsom_jax.simulate.worlds import WorldConfig, make_world
+from dsom_jax.simulate.obstacles import add_obstacles, remove_structure
+from dsom_jax.training.buildings import WorldSource, random_poses
 from dsom_jax.types import Array, Key
 
-T = TypeVar("T")
-
-
-class Building(NamedTuple):
-    """What the map shows and what a lidar sees; free space of ``seen`` is part of that of ``shown``."""
-
-    shown: OccupancyGrid
-    seen: OccupancyGrid
-
-
-WorldSource = Callable[[Key], Building]
-"""Draws a building; :func:`procedural_source`, :func:`crop_source` or :func:`mixed_source`."""
+PIECES = 24
+"""Bearings of a full turn between which shifts of misplaced walls are interpolated."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +33,7 @@ class ScanConfig:
         range_max: metres.
         reach_min: shortest maximal range drawn, metres.
         fov_min: narrowest field of view drawn, radians.
+        fov_max: widest field of view, radians.
         limited: probability that a scan has a shorter reach, and likewise a narrower view.
         thinning: at most every so many-th beam is kept.
         sigma: largest standard deviation of the ranges, metres.
@@ -52,12 +44,15 @@ class ScanConfig:
             coarse cells of real maps begin before their walls.
         deep: probability that a scan has such a depth.
         bare: probability that the map of a procedural building shows its walls only, as floor plans do.
+        removed: least and largest number of pieces of mapped structure per 43 m x 43 m that are not there.
+        misplaced: standard deviation, metres, by which walls stand elsewhere than the map says, piece by piece.
     """
 
     beams: int = 360
     range_max: float = 10.0
     reach_min: float = 5.0
     fov_min: float = math.pi
+    fov_max: float = 2 * math.pi
     limited: float = 0.3
     thinning: int = 5
     sigma: float = 0.05
@@ -67,15 +62,18 @@ class ScanConfig:
     depth: tuple[float, float] = (-0.1, 0.35)
     deep: float = 0.5
     bare: float = 0.2
+    removed: tuple[int, int] = (0, 0)
+    misplaced: float = 0.0
 
     def __post_init__(self) -> None:
         checks.count(self, "beams thinning")
         checks.positive(self, "range_max reach_min fov_min")
         checks.within(self, "reach_min", 0, self.range_max, f"must not exceed range_max = {self.range_max!r} m")
-        checks.within(self, "fov_min", 0, 2 * math.pi + 1e-6, "give radians, at most a full turn")
-        checks.not_negative(self, "sigma")
+        checks.within(self, "fov_max", 0, 2 * math.pi + 1e-6, "give radians, at most a full turn")
+        checks.within(self, "fov_min", 0, self.fov_max + 1e-6, f"must not exceed fov_max = {self.fov_max!r} rad")
+        checks.not_negative(self, "sigma misplaced")
         checks.share(self, "limited dropout short deep bare")
-        checks.interval(self, "obstacles", 0)
+        checks.interval(self, "obstacles removed", 0)
         checks.interval(self, "depth")
 
     @property
@@ -87,7 +85,7 @@ class ScanConfig:
 def plain(config: ScanConfig) -> ScanConfig:
     """Full scans with little noise; the map lacks only 20 obstacles per 43 m x 43 m."""
     quiet = replace(config, sigma=0.02, dropout=0.0, short=0.0, deep=0.0)
-    return replace(quiet, limited=0.0, thinning=1, obstacles=(20, 20), bare=0.0)
+    return replace(quiet, limited=0.0, thinning=1, obstacles=(20, 20), bare=0.0, removed=(0, 0), misplaced=0.0)
 
 
 PLAIN = plain(ScanConfig())
@@ -98,11 +96,12 @@ class Batch(NamedTuple):
     """N buildings with S scans each.
 
     Attributes:
-        occupied: (N, H, W) bool, the map without the obstacles.
+        occupied: (N, H, W) bool, the map without the obstacles, at the network's scale.
         free: (N, H, W) bool, where probability may go.
         ranges: (N, S, B) metres; NaN for beams that the scan does not have.
         conditions: reach and gap (N, S) of the scans.
         poses: (N, S, 3) in the grid's frame (metres from its lower-left corner, radians).
+        views: what would be seen from where in maps that were finer, (N, H/2, W/2, A) metres; None for others.
     """
 
     occupied: Array
@@ -110,19 +109,7 @@ class Batch(NamedTuple):
     ranges: Array
     conditions: Conditions
     poses: Array
-
-
-def random_poses(key: Key, free: Array, resolution: float, count: int) -> Array:
-    """Poses (count, 3) uniform over the free cells (H, W), in the grid's frame."""
-    k_cell, k_offset = jax.random.split(key)
-    # Inverse of the cumulative count: picks the n-th free cell, never one that is not free.
-    cumulative = jnp.cumsum(free.ravel(), dtype=jnp.int32)
-    rank = jax.random.randint(k_cell, (count,), 0, jnp.maximum(cumulative[-1], 1))
-    cell = jnp.searchsorted(cumulative, rank, side="right")
-    u = jax.random.uniform(k_offset, (count, 3))
-    x = (cell % free.shape[1] + u[:, 0]) * resolution
-    y = (cell // free.shape[1] + u[:, 1]) * resolution
-    return jnp.stack([x, y, (2 * u[:, 2] - 1) * jnp.pi], axis=-1)
+    views: Array | None = None
 
 
 def random_conditions(key: Key, config: ScanConfig) -> tuple[Conditions, Array]:
@@ -130,8 +117,8 @@ def random_conditions(key: Key, config: ScanConfig) -> tuple[Conditions, Array]:
     r = jax.random.uniform(key, (6,))
     short = config.reach_min + (config.range_max - config.reach_min) * r[1]
     reach = jnp.where(r[0] < config.limited, short, config.range_max)
-    narrow = config.fov_min + (2 * math.pi - config.fov_min) * r[3]
-    fov = jnp.where(r[2] < config.limited, narrow, 2 * math.pi)
+    narrow = config.fov_min + (config.fov_max - config.fov_min) * r[3]
+    fov = jnp.where(r[2] < config.limited, narrow, config.fov_max)
     step = 1 + jnp.floor(r[4] * config.thinning).astype(jnp.int32)
     beam = jnp.arange(config.beams)
     shifted = (beam + jnp.floor(r[5] * config.beams).astype(jnp.int32)) % config.beams
@@ -152,23 +139,44 @@ def random_depth(key: Key, config: ScanConfig) -> Array:
     return jnp.where(r[0] < config.deep, config.depth[0] + (config.depth[1] - config.depth[0]) * r[1], 0.0)
 
 
+def misplace(key: Key, ranges: Array, sigma: float) -> Array:
+    """Ranges (B,) of a full turn to walls that stand elsewhere, by ``sigma`` metres that vary with the bearing."""
+    shifts = sigma * jax.random.normal(key, (PIECES,))
+    where = jnp.arange(ranges.size) * (PIECES / ranges.size)
+    return jnp.maximum(ranges + jnp.interp(where, jnp.arange(PIECES), shifts, period=PIECES), 0.0)
+
+
 def spoil_scan(key: Key, ranges: Array, config: ScanConfig) -> tuple[Array, Conditions]:
     """A clean scan (B,) with noise, reach, view and thinning of its own."""
     k_conditions, k_noise, k_observe, k_depth = jax.random.split(key, 4)
     ranges = jnp.maximum(ranges + random_depth(k_depth, config), 0.0)
+    if config.misplaced:
+        ranges = misplace(jax.random.fold_in(k_depth, 1), ranges, config.misplaced)
     conditions, present = random_conditions(k_conditions, config)
     ranges = observe(k_observe, ranges, config.lidar, random_noise(k_noise, config))
     ranges = jnp.where(ranges < conditions.reach, ranges, jnp.inf)
     return jnp.where(present, ranges, jnp.nan), conditions
 
 
+def disturbed(keys: tuple[Key, Key], grid: OccupancyGrid, config: ScanConfig) -> OccupancyGrid:
+    """The world ``grid`` with unknown obstacles (their number by the first key), and without some of its structure."""
+    k_number, k_obstacles = keys
+    area = grid.size[0] * grid.size[1] / 43.0**2
+    (fewest, most_gone), (least, most) = (
+        [round(n * area) for n in both] for both in (config.removed, config.obstacles)
+    )
+    if most_gone:
+        k_gone, k_which = jax.random.split(jax.random.fold_in(k_number, 1))
+        gone = jax.random.randint(k_gone, (), fewest, most_gone + 1)
+        grid = remove_structure(k_which, grid, gone, max_count=most_gone)
+    number = jax.random.randint(k_number, (), least, most + 1)
+    return add_obstacles(k_obstacles, grid, number, max_count=most) if most else grid
+
+
 def make_scans(key: Key, grid: OccupancyGrid, config: ScanConfig, count: int) -> tuple[Array, Conditions, Array]:
     """Scans (S, B), their conditions (S,) and poses (S, 3) in one building furnished with unknown obstacles."""
     k_number, k_obstacles, k_poses, k_scans = jax.random.split(key, 4)
-    area = grid.size[0] * grid.size[1] / 43.0**2
-    least, most = (round(number * area) for number in config.obstacles)
-    number = jax.random.randint(k_number, (), least, most + 1)
-    seen = add_obstacles(k_obstacles, grid, number, max_count=most) if most else grid
+    seen = disturbed((k_number, k_obstacles), grid, config)
     poses = random_poses(k_poses, seen.free, grid.resolution, count)
     tables = make_tables(seen, RaycastConfig("exact"), config.range_max)
     clean = cast_rays(tables, grid.from_grid(poses), config.lidar)
@@ -176,82 +184,20 @@ def make_scans(key: Key, grid: OccupancyGrid, config: ScanConfig, count: int) ->
     return ranges, conditions, poses
 
 
-def make_batch(key: Key, source: WorldSource, config: ScanConfig, worlds: int, scans: int) -> Batch:
-    """``worlds`` buildings of ``source`` with ``scans`` scans each."""
+def make_batch(
+    key: Key, source: WorldSource, config: ScanConfig, worlds: int, scans: int, model: DSOMConfig | None = None
+) -> Batch:
+    """``worlds`` buildings of ``source`` with ``scans`` scans each; ``model`` says what views of finer maps are."""
 
-    def one(key: Key) -> Batch:
+    def one(key: Key) -> tuple[Batch, OccupancyGrid | None]:
         k_world, k_scans = jax.random.split(key)
-        shown, seen = source(k_world)
-        return Batch(shown.occupied, shown.free, *make_scans(k_scans, seen, config, scans))
+        shown, seen, given = source(k_world)
+        return Batch(shown.occupied, shown.free, *make_scans(k_scans, seen, config, scans)), given
 
-    return jax.vmap(one)(jax.random.split(key, worlds))
-
-
-def procedural_source(world: WorldConfig, bare: float) -> WorldSource:
-    """Procedural buildings; with probability ``bare`` the map lacks all that is not a wall."""
-    empty = replace(world, furniture=0.0, pillars=0.0, shelves=0.0)
-
-    def draw(key: Key) -> Building:
-        k_world, k_bare = jax.random.split(key)
-        seen = make_world(k_world, world)
-        if not bare:
-            return Building(seen, seen)
-        return Building(choose(jax.random.uniform(k_bare) < bare, make_world(k_world, empty), seen), seen)
-
-    return draw
-
-
-def mixed_source(first: WorldSource, second: WorldSource, share: float) -> WorldSource:
-    """``first`` with probability ``share``, else ``second``."""
-
-    def draw(key: Key) -> Building:
-        k_which, k_first, k_second = jax.random.split(key, 3)
-        return choose(jax.random.uniform(k_which) < share, first(k_first), second(k_second))
-
-    return draw
-
-
-def choose(condition: Array, first: T, second: T) -> T:
-    """``first`` where ``condition`` () holds, else ``second``, leaf by leaf."""
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), first, second)
-
-
-class MapPool(NamedTuple):
-    """Given maps at one resolution, padded to a common shape: occupied and free (N, H, W)."""
-
-    occupied: Array
-    free: Array
-
-
-def make_pool(grids: list[OccupancyGrid], cells: int) -> MapPool:
-    """Stack maps of one resolution; every side is at least ``cells``."""
-    shape = [max(cells, *(grid.shape[axis] for grid in grids)) for axis in (0, 1)]
-
-    def stack(layers: list[Array]) -> Array:
-        return jnp.stack([jnp.pad(a, [(0, n - m) for n, m in zip(shape, a.shape, strict=True)]) for a in layers])
-
-    return MapPool(stack([grid.occupied for grid in grids]), stack([grid.free for grid in grids]))
-
-
-def crop_source(pool: MapPool, cells: int, resolution: float) -> WorldSource:
-    """Random square crops of given maps around a free cell, turned by quarters and mirrored at random."""
-
-    def draw(key: Key) -> Building:
-        k_map, k_cell, k_turn = jax.random.split(key, 3)
-        number = jax.random.randint(k_map, (), 0, pool.free.shape[0])
-        occupied, free = pool.occupied[number], pool.free[number]
-        x, y = random_poses(k_cell, free, 1.0, 1)[0, :2].astype(jnp.int32)
-        corner = [jnp.clip(c - cells // 2, 0, n - cells) for c, n in zip((y, x), free.shape, strict=True)]
-        turn = jax.random.randint(k_turn, (), 0, 8)
-        occupied, free = (turned(jax.lax.dynamic_slice(a, corner, (cells, cells)), turn) for a in (occupied, free))
-        grid = OccupancyGrid(occupied, free, jnp.zeros(3), resolution)
-        return Building(grid, grid)
-
-    return draw
-
-
-def turned(square: Array, turn: Array) -> Array:
-    """One of the eight symmetries of a square array (n, n)."""
-    square = jnp.where(turn & 1, square[::-1], square)
-    square = jnp.where(turn & 2, square[:, ::-1], square)
-    return jnp.where(turn & 4, square.T, square)
+    batch, given = jax.vmap(one)(jax.random.split(key, worlds))
+    if given is None or model is None or not model.panorama:
+        return batch
+    shape = (batch.free.shape[1], batch.free.shape[2])
+    # One map after the other: rays of a batch of maps would all wait for the last one.
+    views = jax.lax.map(lambda one: finer_ranges(one, model, shape, given.resolution), given.occupied)
+    return batch._replace(views=views)

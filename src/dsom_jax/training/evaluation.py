@@ -59,7 +59,7 @@ def score_batch(model: DSOM, batch: Batch, lidar: LidarConfig) -> Score:
         return score_map(masked_log_softmax(logits, features.free), pose, model.config.resolution)
 
     def one_map(part: Batch) -> Score:
-        features = encode_map(model, part.occupied, part.free)
+        features = encode_map(model, part.occupied, part.free, part.views)
         return jax.lax.map(partial(scored, features), (part.ranges, part.conditions, part.poses))
 
     return jax.lax.map(one_map, batch)

@@ -16,12 +16,11 @@ from dsom_jax.compiling import training_options
 from dsom_jax.nn import DSOM, DSOMConfig, create
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.simulate.worlds import WorldConfig
-from dsom_jax.training.batches import (
-    Batch,
-    ScanConfig,
+from dsom_jax.training.batches import Batch, ScanConfig, make_batch
+from dsom_jax.training.buildings import (
     WorldSource,
+    crop_side,
     crop_source,
-    make_batch,
     make_pool,
     mixed_source,
     procedural_source,
@@ -146,7 +145,7 @@ def batch_losses(model: DSOM, batch: Batch, config: TrainConfig) -> Losses:
     """Losses of a batch under a training view."""
     observe = partial(model.observation, lidar=config.scan.lidar)
     observations = jax.vmap(jax.vmap(lambda r, c: observe(r, conditions=c)))(batch.ranges, batch.conditions)
-    outputs = model(batch.occupied, observations)
+    outputs = model(batch.occupied, observations, batch.views)
     shape = (batch.free.shape[1], batch.free.shape[2])
     target = make_target(batch.poses, shape, config.model.headings, config.model.resolution, config.blur)
     return dsom_losses(outputs, target, batch.free, config.similarity_weight)
@@ -171,13 +170,20 @@ def make_step(config: TrainConfig) -> Callable[[TrainState, Batch, Array], tuple
 
 
 def world_source(config: TrainConfig, stage: StageConfig, grids: list[OccupancyGrid] | None = None) -> WorldSource:
-    """Procedural buildings, crops of ``grids``, which have the model's resolution, or some of both."""
+    """Procedural buildings, crops of ``grids``, or some of both.
+
+    ``grids`` have one resolution: the model's, or a finer one if nothing is mixed with them.
+    """
+    if grids and config.maps_share == 1.0:
+        scale, own = config.model.resolution, grids[0].resolution
+        fine = own if own < scale - 1e-4 else None
+        return crop_source(make_pool(grids, crop_side(stage.cells, scale, fine or scale)), stage.cells, scale, fine)
     world = replace(config.world, cells=stage.cells, resolution=config.model.resolution)
     procedural = procedural_source(world, config.scan.bare)
     if not grids:
         return procedural
     crops = crop_source(make_pool(grids, stage.cells), stage.cells, config.model.resolution)
-    return crops if config.maps_share == 1.0 else mixed_source(crops, procedural, config.maps_share)
+    return mixed_source(crops, procedural, config.maps_share)
 
 
 def make_batches(config: TrainConfig, grids: list[OccupancyGrid] | None = None) -> Callable[[int, int], Batch]:
@@ -187,7 +193,9 @@ def make_batches(config: TrainConfig, grids: list[OccupancyGrid] | None = None) 
     def stage_maker(stage: StageConfig) -> Callable[[Array], Batch]:
         source = world_source(config, stage, grids)
         return jax.jit(
-            lambda step: make_batch(jax.random.fold_in(root, step), source, config.scan, stage.worlds, stage.scans)
+            lambda step: make_batch(
+                jax.random.fold_in(root, step), source, config.scan, stage.worlds, stage.scans, config.model
+            )
         )
 
     early, late = stage_maker(config.early), stage_maker(config.late)

@@ -21,7 +21,7 @@ from dsom_jax.raycast import RaycastConfig, cast_rays, make_tables
 from dsom_jax.simulate.drive import DriveConfig, measure
 from dsom_jax.simulate.obstacles import add_obstacles, remove_structure
 from dsom_jax.simulate.paths import drive, roads
-from dsom_jax.training.batches import make_pool, random_poses
+from dsom_jax.training.buildings import make_pool, random_poses
 from dsom_jax.types import Array, Key
 
 

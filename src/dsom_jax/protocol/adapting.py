@@ -1,0 +1,44 @@
+"""The network of a map: the one to start from, trained on for some minutes with the log's lidar in that building."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from dsom_jax import checkpoint
+from dsom_jax.atomic import write_atomic
+from dsom_jax.errors import UserError
+from dsom_jax.lidar import LidarConfig
+from dsom_jax.protocol.plan import Plan
+
+
+def settings(start: Path, lidar: LidarConfig, changes: dict[str, Any]) -> dict[str, Any]:
+    """Fields of ``TrainConfig`` for scans of ``lidar``, on top of the network in ``start``."""
+    model = dict(checkpoint.load_provenance(start)["model"])
+    view = min(lidar.fov, 2 * math.pi)
+    reach = min(lidar.range_max, float(model["reach_min"]))
+    model |= {"fov_min": view, "reach_min": reach}
+    scan = {"fov_min": view, "fov_max": view, "reach_min": reach, "thinning": 2}
+    given = {"model": model, "scan": scan}
+    for name, value in changes.items():
+        given[name] = given[name] | value if isinstance(value, dict) and name in given else value
+    return given
+
+
+def adapt(plan: Plan, map_yaml: Path, start: Path, lidar: LidarConfig, folder: Path) -> Path:
+    """Folder of the network adapted to a map; a training that was killed goes on where it was."""
+    if not plan.adapt_minutes > 0:
+        return start
+    config = folder.with_suffix(".yaml")
+    write_atomic(config, yaml.safe_dump(settings(start, lidar, plan.adapt)).encode())
+    words = ["--maps", map_yaml, "--init", start, "--minutes", plan.adapt_minutes, "--out", folder, "--resume"]
+    words += ["--config", config]
+    done = subprocess.run([sys.executable, "-m", "dsom_jax.train", *map(str, words)])
+    if done.returncode:
+        raise UserError(f"{folder}: training on {map_yaml.name} failed; its message is above")
+    return folder

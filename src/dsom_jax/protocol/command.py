@@ -1,0 +1,89 @@
+"""The command: maps one after another, then the report; results that exist are kept."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+from dsom_jax import checkpoint, report
+from dsom_jax.data import load_map
+from dsom_jax.data.suite import Suite
+from dsom_jax.errors import UserError
+from dsom_jax.filters.methods import network_of
+from dsom_jax.protocol.adapting import adapt
+from dsom_jax.protocol.clips import choose
+from dsom_jax.protocol.plan import Plan, Variant, map_file, read_logs, read_plan, variants
+from dsom_jax.protocol.reporting import write_report
+from dsom_jax.protocol.running import Builder, is_done, run_variant
+
+
+@dataclass(frozen=True)
+class Args:
+    """Run one configuration."""
+
+    config: Path
+    """Configuration file, such as experiments/real/paper.yaml."""
+    data: Path
+    """Folder of the data set."""
+    out: Path
+    """Folder for results, tables and figures."""
+    work: Path
+    """Folder for networks and single runs, which a repetition takes up again."""
+    checkpoint: Path | None = None
+    """Network to start from; default: the one in the repository."""
+    adapt_minutes: float | None = None
+    """Minutes of training on each map, in place of the configuration's; 0 takes the network as it is."""
+    runs: int | None = None
+    """Monte-Carlo runs of each clip, in place of the configuration's."""
+    only: tuple[str, ...] = ()
+    """Names of maps; default: all."""
+
+
+def main(args: Args) -> None:
+    """All maps of a configuration."""
+    plan = read_plan(args.config, {"runs": args.runs, "adapt_minutes": args.adapt_minutes})
+    if not args.data.is_dir():
+        raise UserError(f"--data {args.data}: no such folder; name the folder of the data set")
+    if set(args.only) - set(plan.maps):
+        raise UserError(f"--only {' '.join(args.only)}: the configuration has {', '.join(plan.maps)}")
+    start = start_network(plan, args)
+    logs = {name: list(read_logs(plan.on(name)[0], args.data)) for name in args.only or plan.maps}
+    out, work = report.output_folder(args.out), report.output_folder(args.work)
+    for name in logs:
+        one, fields = plan.on(name)
+        map_yaml = map_file(name, fields, args.data, work)
+        suite = choose(one, logs[name], name, load_map(map_yaml))
+        run_map(one, suite, map_yaml, start, name, out, work)
+        write_report(plan, out, work)
+
+
+def start_network(plan: Plan, args: Args) -> Path | None:
+    """The network that training begins with, if any method draws from one."""
+    start = args.checkpoint or checkpoint.shipped()
+    if start is None and any(network_of(v.method) == "dsom" for v in variants(plan)):
+        raise UserError("--checkpoint: no network is shipped; name the folder of one")
+    return start
+
+
+def run_map(plan: Plan, suite: Suite, map_yaml: Path, start: Path | None, name: str, out: Path, work: Path) -> None:
+    """What is missing of the results of one map, in ``out``/NAME and ``work``/NAME."""
+
+    @cache
+    def adapted() -> Path | None:
+        return start and adapt(plan, map_yaml, start, suite.lidar, work / "networks" / name)
+
+    def network(variant: Variant) -> Path | None:
+        kind = network_of(variant.method)
+        if kind != "dsom":
+            return checkpoint.shipped(kind) if kind else None
+        return start if variant.shipped else adapted()
+
+    folders = report.output_folder(out / name), report.output_folder(work / name)
+    build = Builder(plan, suite, network)
+    for variant in variants(plan):
+        if is_done(variant, plan, suite, *folders):
+            print(f"{name}, {variant.stem}: kept", flush=True)
+            continue
+        run_variant(variant, plan, suite, build, *folders)
+        print(f"{name}, {variant.stem}: done", flush=True)

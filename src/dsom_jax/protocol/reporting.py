@@ -1,0 +1,178 @@
+"""Tables, paired tests and figures from the stored results of all maps."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dsom_jax import plotting, report
+from dsom_jax.protocol.plan import Plan, Variant, variants
+from dsom_jax.protocol.running import read_traces
+from dsom_jax.run_table import RunTable, join, paired
+from dsom_jax.statistics import Evidence, corrected, rate_evidence, value_evidence
+
+COLUMNS = ("method", "network", "T_cut", "converged %", "steps", "E_pos m", "kept %", "strict %", "sure and wrong %")
+PHASES = {"global": "Global localization", "kidnap": "Spliced kidnapping"}
+LEGEND = """\
+Every clip starts without any prior on the pose; at its end the robot is carried to the start of the next one unnoticed.
+
+- converged: 5 updates in a row within 2 m and 10 deg [95 % interval, Wilson]; steps: updates before, median
+- E_pos: mean final error of the converged runs [95 % interval, bootstrap]; kept: share of the later updates still
+  within [Wilson, runs as trials]; strict: last estimate within 0.5 m and 5 deg
+- sure and wrong: updates at which the filter claims to know (lost < 5 %) and is not within 2 m and 10 deg
+- the paper's filters are judged by the weighted mean of the particles, robust ones by the heaviest cluster
+- network: adapted to the map by minutes of training in it, or as shipped
+"""
+
+
+def write_report(plan: Plan, out: Path, work: Path) -> None:
+    """``out``/REPORT.md with everything that is there, and the figures of each map."""
+    parts = [f"# {plan.name}\n\nWritten by the experiment's command from its results; do not edit.\n\n{LEGEND}"]
+    for name in plan.maps:
+        entries = load_entries(plan, out / name)
+        if not entries:
+            continue
+        parts.append(f"\n## {name}\n\n{made_with(entries)}\n")
+        parts += [table(entries, phase) for phase in PHASES]
+        parts.append(tests(plan, work / name, entries))
+        figures(plan, out / name, work / name, entries)
+    report.write_text(out / "REPORT.md", "\n".join(parts))
+
+
+def load_entries(plan: Plan, folder: Path) -> dict[Variant, dict[str, Any]]:
+    """The results of one map that exist, in the order of the plan."""
+    files = {variant: folder / f"{variant.stem}.json" for variant in variants(plan)}
+    return {variant: json.loads(path.read_text()) for variant, path in files.items() if path.is_file()}
+
+
+def made_with(entries: dict[Variant, dict[str, Any]]) -> str:
+    """One line for each configuration among the results."""
+    keys = ("commit", "particles", "clips", "runs", "updates", "seed", "map_kind")
+    made = dict.fromkeys(tuple(entry[key] for key in keys) for entry in entries.values())
+    return "\n".join(
+        f"Commit {c}: {p} particles, {n} clips x {r} runs, {t} updates in each phase, seed {s}, map {k}."
+        for c, p, n, r, t, s, k in made
+    )
+
+
+def table(entries: dict[Variant, dict[str, Any]], phase: str) -> str:
+    """Markdown table of one phase."""
+    rows = [COLUMNS, ("---", "---", *["---:"] * (len(COLUMNS) - 2))]
+    rows += [row(variant, entry[phase]) for variant, entry in entries.items()]
+    lines = ["| " + " | ".join(cells) + " |" for cells in rows]
+    return f"**{PHASES[phase]}**\n\n" + "\n".join(lines) + "\n"
+
+
+def row(variant: Variant, m: dict[str, Any]) -> tuple[str, ...]:
+    """Cells of one variant."""
+    drawn = "dsom" in variant.method or "hybrid" in variant.method
+    network = ("shipped" if variant.shipped else "adapted") if drawn else ""
+    return (
+        f"`{variant.method}`", network, "" if variant.t_cut is None else f"{variant.t_cut:g}",
+        rate(m, "converged"), number(m["steps_median"], "{:g}"),
+        number(m["e_pos_m"], "{:.3f}") + interval(m["e_pos_ci95"], "{:.3f}", 1),
+        rate(m, "retention"), number(m["strict_success"], "{:.1f}", 100), number(m["false_confident"], "{:.1f}", 100),
+    )  # fmt: skip
+
+
+def rate(m: dict[str, Any], name: str) -> str:
+    """A share in percent with its interval."""
+    if m[name] is None:
+        return "-"
+    return number(m[name], "{:.1f}", 100) + interval(m[f"{name}_ci95"], "{:.1f}", 100)
+
+
+def number(value: float | None, form: str, scale: float = 1) -> str:
+    """A number, or a dash where there is none."""
+    return "-" if value is None else form.format(scale * value)
+
+
+def interval(bounds: list[float | None], form: str, scale: float) -> str:
+    """Bounds in brackets, nothing where there are none."""
+    low, high = bounds
+    return "" if low is None or high is None else f" [{form.format(scale * low)}-{form.format(scale * high)}]"
+
+
+def pairs(entries: dict[Variant, dict[str, Any]]) -> Iterator[tuple[Variant, Variant]]:
+    """What is compared: networks, values of T_cut, every method with the paper's, proposals, filters."""
+    there = list(entries)
+    first = next((v.t_cut for v in there if v.t_cut is not None), None)
+
+    def find(method: str, shipped: bool = False, t_cut: float | None = first) -> Variant | None:
+        cut = t_cut if method.startswith("adam_") else None
+        return next((v for v in there if v == Variant(method, shipped, cut)), None)
+
+    others = [v.t_cut for v in there if v.method == "adam_dsom" and v.t_cut != first and not v.shipped]
+    chosen = [(find("adam_dsom"), find("adam_dsom", shipped=True)), (find("robust_dsom"), find("adam_dsom"))]
+    chosen += [(find("adam_dsom"), find("adam_dsom", t_cut=cut)) for cut in others]
+    chosen += [
+        (find("adam_dsom"), find(name)) for name in ("mcl", "mixture_mcl", "mixture_mcl_star", "pf_net", "pfrnn")
+    ]
+    chosen += [(find(name), find("adam_dsom")) for name in ("adam_likelihood_grid", "adam_hybrid")]
+    chosen += [(find("robust_likelihood_grid"), find(name)) for name in ("adam_likelihood_grid", "robust_dsom")]
+    yield from ((a, b) for a, b in chosen if a and b)
+
+
+def tests(plan: Plan, work: Path, entries: dict[Variant, dict[str, Any]]) -> str:
+    """Paired comparisons of both phases, corrected as one family."""
+    found = [
+        (a, b) for a, b in pairs(entries) if (work / f"{a.stem}.npz").is_file() and (work / f"{b.stem}.npz").is_file()
+    ]
+    if not found:
+        return ""
+    evidence: list[Evidence] = []
+    for a, b in found:
+        both = join([read_traces(work / f"{v.stem}.npz")[0] for v in (a, b)])
+        for phase in PHASES:
+            evidence += compare(both, a, b, phase, plan.seed)
+    lines = ["| a against b | phase | what | a - b [95 % interval] | p (Holm) |", "| --- | --- | --- | ---: | ---: |"]
+    lines += [line(piece) for piece in corrected(evidence)]
+    note = (
+        f"Paired tests: same clips, same seeds. Intervals draw clips first, and {plan.clips} clips are few; "
+        "p is McNemar's for rates and Wilcoxon's for errors, corrected for all rows of this map."
+    )
+    return "\n".join([note, "", *lines]) + "\n"
+
+
+def compare(both: RunTable, a: Variant, b: Variant, phase: str, seed: int) -> list[Evidence]:
+    """Convergence and final error of two variants, run by run."""
+    one, other = paired(both, a.stem, b.stem, phase)
+    what = f"{a.stem} | {b.stem} | {PHASES[phase]}"
+    mine, theirs = (np.where(np.isfinite(side.e_pos_m), side.e_pos_m, np.nan) for side in (one, other))
+    return [
+        rate_evidence(f"{what} | converged, share of runs", one.converged, other.converged, one.sequence, seed),
+        value_evidence(f"{what} | final error of all runs, m", mine, theirs, one.sequence, seed),
+    ]
+
+
+def line(piece: Evidence) -> str:
+    """A row of the table of tests."""
+    a, b, phase, what = piece.what.split(" | ")
+    p = "-" if piece.p is None or math.isnan(piece.p) else f"{piece.p:.2g}"
+    return f"| `{a}`, `{b}` | {phase} | {what} | {piece.estimate:.3f} [{piece.low:.3f}, {piece.high:.3f}] | {p} |"
+
+
+def figures(plan: Plan, out: Path, work: Path, entries: dict[Variant, dict[str, Any]]) -> None:
+    """Error over the updates with its 95 % band, as in the paper's figures of real data; boxes of final errors."""
+    runs = {v: read_traces(work / f"{v.stem}.npz") for v in entries if (work / f"{v.stem}.npz").is_file()}
+    shown = [v for v in runs if v.name in (plan.shown or plan.methods) and v.t_cut in (None, plan.t_cuts[0])]
+    if not shown:
+        return
+    clips = range(len(runs[shown[0]][1]))
+    traces = [{v.name: runs[v][1][clip] for v in shown} for clip in clips]
+    moved = np.arange(2 * plan.updates) == plan.updates
+    evolution = plotting.error_evolution(traces, [moved] * len(traces))
+    boxes = plotting.error_boxes({phase: {v.name: final(runs[v][0], phase) for v in shown} for phase in PHASES})
+    for name, figure in (("error_evolution", evolution), ("position_error", boxes)):
+        for ending in ("png", "pdf"):
+            plotting.save(figure, out / f"{name}.{ending}")
+
+
+def final(table: RunTable, phase: str) -> np.ndarray:
+    """(n,) final E_pos of a phase, metres."""
+    return table.rows(table.phase == phase).e_pos_m

@@ -1,0 +1,113 @@
+"""All methods on the clips of one map, each in files of its own, so that an interrupted series goes on."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dsom_jax import bench, checkpoint, plotting, report
+from dsom_jax.data.suite import Suite
+from dsom_jax.episode import Episode
+from dsom_jax.errors import UserError
+from dsom_jax.filters.methods import COMBINATIONS, DRAWN, LEARNED, PARTS, REAL, make_filter, make_proposal, network_of
+from dsom_jax.montecarlo import run_keys
+from dsom_jax.occupancy import OccupancyGrid
+from dsom_jax.proposals.dual_features import with_episode
+from dsom_jax.protocol.plan import Plan, Variant
+from dsom_jax.run_table import RunTable
+from dsom_jax.types import Filter, Proposal
+
+ROOT = Path(__file__).resolve().parents[3]
+Networks = Callable[[Variant], Path | None]
+"""Folder of the network that a variant needs."""
+
+
+class Builder:
+    """Filters on the map of a suite; proposals are made once for each network."""
+
+    def __init__(self, plan: Plan, suite: Suite, networks: Networks) -> None:
+        self.plan, self.suite, self.networks = plan, suite, networks
+        self.made: dict[Path | None, dict[str, Proposal]] = {}
+
+    def __call__(self, variant: Variant, grid: OccupancyGrid, episode: Episode) -> Filter:
+        plan, lidar = self.plan, self.suite.lidar
+        base = DRAWN if plan.map_kind == "drawn" else REAL
+        settings = replace(base, particles=plan.particles, t_cut=variant.t_cut or base.t_cut, seed=plan.seed)
+        folder, kind = self.networks(variant), network_of(variant.method)
+        network = checkpoint.load(folder, lidar, kind=kind) if folder and kind else None
+        if variant.method in LEARNED:
+            return LEARNED[variant.method](network, grid, lidar, plan.particles)
+        algorithm, source = COMBINATIONS[variant.method]
+        name, made = source.removesuffix("_star"), self.made.setdefault(folder, {})
+        for needed in (*PARTS.get(name, ()), name):
+            if needed not in made:
+                made[needed] = make_proposal(needed, grid, lidar, settings, network, made)
+        starred = source != name
+        proposal = with_episode(made[name], episode) if starred else made[name]  # type: ignore[arg-type]
+        return make_filter(algorithm, proposal, grid, lidar, settings)
+
+
+def run_variant(variant: Variant, plan: Plan, suite: Suite, build: Builder, out: Path, work: Path) -> None:
+    """One method on all clips: OUT/STEM.json, and every run and a picture in WORK."""
+    keys = [run_keys(plan.seed, number, plan.runs) for number in range(len(suite.episodes))]
+    record = bench.run_method(variant.method, suite, keys, lambda _, __, grid, episode: build(variant, grid, episode))
+    shared = bench.Settings(plan.runs, plan.particles, variant.t_cut or plan.t_cuts[0], plan.seed)
+    entry = bench.summary(suite, {variant.method: record}, shared)["methods"][variant.method]
+    draw(variant, suite, record, work)
+    save_runs(work / f"{variant.stem}.npz", record, variant.stem)
+    facts = {"variant": variant.name, "t_cut": variant.t_cut, **identity(plan, suite), "commit": commit()}
+    report.write_json(out / f"{variant.stem}.json", facts | entry)
+
+
+def identity(plan: Plan, suite: Suite) -> dict[str, Any]:
+    """What must be the same for a result to be kept."""
+    return {
+        "suite": suite.name, "map_kind": plan.map_kind, "runs": plan.runs, "particles": plan.particles,
+        "clips": plan.clips, "updates": plan.updates, "seed": plan.seed, "laser_max_range": plan.laser_max_range,
+    }  # fmt: skip
+
+
+def is_done(variant: Variant, plan: Plan, suite: Suite, out: Path, work: Path) -> bool:
+    """Whether the results of a variant are there and were made as the plan says."""
+    path = out / f"{variant.stem}.json"
+    if not (path.is_file() and (work / f"{variant.stem}.npz").is_file()):
+        return False
+    try:
+        found = json.loads(path.read_text())
+    except json.JSONDecodeError as error:
+        raise UserError(f"{path}: not JSON ({error}); delete it to have it made again") from None
+    return all(found.get(name) == value for name, value in identity(plan, suite).items())
+
+
+def save_runs(path: Path, record: bench.Record, name: str) -> None:
+    """Every single run and E_pos over the updates, metres (clips, runs, updates)."""
+    table = record.table._replace(method=np.full(len(record.table.run), name))
+    report.write_runs(path, table, e_pos=np.stack(record.traces).astype(np.float32))
+
+
+def read_traces(path: Path) -> tuple[RunTable, np.ndarray]:
+    """What :func:`save_runs` wrote."""
+    with np.load(path) as columns:
+        return report.read_runs(path), columns["e_pos"]
+
+
+def draw(variant: Variant, suite: Suite, record: bench.Record, work: Path) -> None:
+    """Particles and PM of the first run of the first clip at four moments."""
+    _, grid, episode = suite.episodes[0]
+    estimates = getattr(record.result.info, bench.judged_by(variant.method))[0]
+    figure = plotting.moment_figure(
+        grid, suite.lidar, episode, record.filter, bench.moments(episode), record.result.kept.poses, estimates
+    )
+    plotting.save(figure, work / f"{variant.stem}.png")
+
+
+def commit() -> str:
+    """Commit of the project."""
+    command = ["git", "-C", str(ROOT), "rev-parse", "--short", "HEAD"]
+    return subprocess.run(command, capture_output=True, text=True).stdout.strip() or "unknown"

@@ -1,0 +1,93 @@
+"""The protocol on real logs: what a configuration means, which filter is built of it, how a network is adapted."""
+
+from __future__ import annotations
+
+import math
+import sys
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from dsom_jax import train
+from dsom_jax.cli import parse
+from dsom_jax.errors import UserError
+from dsom_jax.filters.methods import DRAWN
+from dsom_jax.lidar import LidarConfig
+from dsom_jax.protocol import adapting, running
+from dsom_jax.protocol.plan import Plan, Variant, read_plan, variants
+
+ROOT = Path(__file__).resolve().parents[1]
+FILES = ("paper_data/upo.yaml", "paper_data/bicocca.yaml", "real/paper.yaml")
+CONFIGS = {name: ROOT / "experiments" / name for name in FILES}
+
+
+def test_every_method_gets_its_proposal_and_the_settings_of_the_map(monkeypatch):
+    plan = Plan(map_kind="drawn", particles=7)
+    made: list[Any] = []
+    monkeypatch.setattr(running, "make_proposal", lambda name, grid, lidar, settings, net, made: (name, net))
+    monkeypatch.setattr(running, "with_episode", lambda proposal, episode: (*proposal, episode))
+    monkeypatch.setattr(running, "make_filter", lambda *words: made.append(words))
+    monkeypatch.setattr(running.checkpoint, "load", lambda folder, lidar, kind: (kind, folder))
+    build = running.Builder(plan, SimpleNamespace(lidar="lidar"), lambda v: Path("old" if v.shipped else "new"))
+    for variant in (
+        Variant("mixture_mcl"),
+        Variant("mixture_mcl_star"),
+        Variant("adam_dsom", True, 0.5),
+        Variant("adam_dsom", False, 0.4),
+    ):
+        build(variant, "grid", "episode")
+    assert [words[:2] for words in made] == [
+        ("mixture_mcl", ("dual_features", None)), ("mixture_mcl", ("dual_features", None, "episode")),
+        ("adam", ("dsom", ("dsom", Path("old")))), ("adam", ("dsom", ("dsom", Path("new")))),
+    ]  # fmt: skip
+    assert all((w[4].particles, w[4].robust) == (7, DRAWN.robust) for w in made)
+    assert [w[4].t_cut for w in made[2:]] == [0.5, 0.4]
+
+
+@pytest.mark.parametrize("config", CONFIGS)
+def test_shipped_configurations_are_the_papers(config):
+    plan = read_plan(CONFIGS[config], {"runs": None})
+    assert (plan.particles, plan.runs, plan.clips) == (500, 100, 3)
+    assert plan.t_cuts == {"upo": (0.6,), "bicocca": (0.5,), "real": (0.6, 0.5)}[plan.name]
+    kinds = {"upo": ["scanned"], "bicocca": ["drawn"] * 2, "real": ["scanned", "scanned", "drawn"]}
+    assert [plan.on(name)[0].map_kind for name in plan.maps] == kinds[plan.name]
+
+
+def test_t_cut_is_alg_1s_alone():
+    plan = Plan(methods=("mcl", "adam_dsom@shipped", "adam_dsom", "robust_dsom"), t_cuts=(0.6, 0.5))
+    assert [v.stem for v in variants(plan)] == [
+        "mcl", "adam_dsom-shipped-0.6", "adam_dsom-shipped-0.5", "adam_dsom-0.6", "adam_dsom-0.5", "robust_dsom",
+    ]  # fmt: skip
+    assert len({v.name for v in variants(plan)}) == len(plan.methods)
+
+
+def test_a_map_replaces_what_it_names():
+    plan = Plan(maps={"a": {"yaml": "a.yaml", "logs": ["x.log"], "adapt": {"seed": 3}}, "b": {"yaml": "b.yaml"}},
+                logs=("all.log",), adapt={"seed": 1, "warmup": 5})  # fmt: skip
+    own, fields = plan.on("a")
+    assert (own.logs, own.adapt, fields) == (("x.log",), {"seed": 3}, {"yaml": "a.yaml"})
+    assert plan.on("b")[0].logs == ("all.log",) and plan.on("b")[0].adapt == plan.adapt
+
+
+def test_training_is_called_with_words_that_it_knows(monkeypatch, tmp_path):
+    called: list[list[str]] = []
+    monkeypatch.setattr(adapting.subprocess, "run", lambda words: called.append(words) or SimpleNamespace(returncode=0))
+    start, lidar = ROOT / "checkpoints" / "dsom", LidarConfig(180, -math.pi / 2, math.pi / 180)
+    plan = Plan(adapt_minutes=12.0, adapt={"learning_rate": 1e-4, "scan": {"removed": [0, 9]}})
+    folder = adapting.adapt(plan, tmp_path / "map.yaml", start, lidar, tmp_path / "net")
+    monkeypatch.setattr(sys, "argv", called[0][2:])
+    arguments = parse(train.Arguments, "python -m dsom_jax.train")
+    assert folder == arguments.out == tmp_path / "net" and arguments.init == start
+    assert arguments.maps == (tmp_path / "map.yaml",) and arguments.minutes == 12.0
+    config = train.read_config(arguments.config)
+    assert config.scan.fov_min == config.scan.fov_max == config.model.fov_min == pytest.approx(math.pi)
+    assert (config.learning_rate, config.scan.removed, config.maps_share) == (1e-4, (0, 9), 1.0)
+    # It continues what is shipped, and takes its scans from the lidar.
+    assert train.load_init(start, config) is not None and config.model.misfit(lidar) is None
+    assert adapting.adapt(replace(plan, adapt_minutes=0.0), Path("m"), start, lidar, tmp_path) == start
+    monkeypatch.setattr(adapting.subprocess, "run", lambda words: SimpleNamespace(returncode=2))
+    with pytest.raises(UserError, match=r"training on map.yaml failed"):
+        adapting.adapt(plan, tmp_path / "map.yaml", start, lidar, tmp_path / "net")
