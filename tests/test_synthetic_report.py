@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import pytest
 
 import tiny_world
 from dsom_jax.episode import Episode
+from dsom_jax.errors import UserError
 from dsom_jax.filters.methods import build_filter
 from dsom_jax.geometry import relative
 from dsom_jax.lidar import LidarConfig
@@ -222,3 +224,33 @@ def test_pieces_shrink_together():
         small = lab.scaled(piece.config, 2)
         assert all(getattr(small, name, 1) >= 1 for name in lab.SCALED)
         assert list(piece.jobs(small)) == list(piece.jobs(piece.config))
+
+
+def test_a_job_that_fails_stops_no_other(tmp_path, capsys):
+    import run as script
+
+    calls = []
+
+    def job(name: str, error: Exception | None, _: lab.Lab) -> dict[str, Any]:
+        calls.append(name)
+        if error:
+            raise error
+        return {"value": 1.5}
+
+    def jobs(_: Any) -> dict[str, Any]:
+        errors = {"a": ValueError("too odd"), "b": None, "c": UserError("no network"), "d": None}
+        return {name: partial(job, name, error) for name, error in errors.items()}
+
+    piece = lab.Piece("made", comparison.Config(), jobs, lambda _: {}, lambda _: "")
+    assert script.run_piece(piece, lab.Lab(), script.Args(), tmp_path) == ["made.a", "made.c"]
+    assert "ValueError: too odd" in capsys.readouterr().err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["made.b.json", "made.d.json"]
+    # Again: what is there is kept, what failed is tried.
+    assert script.run_piece(piece, lab.Lab(), script.Args(), tmp_path) == ["made.a", "made.c"]
+    assert calls == ["a", "b", "c", "d", "a", "c"]
+
+
+def test_a_damaged_result_is_named(tmp_path):
+    (tmp_path / "made.a.json").write_text('{"made": ')
+    with pytest.raises(UserError, match=r"made\.a\.json"):
+        lab.read(tmp_path / "made.a.json")

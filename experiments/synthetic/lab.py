@@ -35,6 +35,12 @@ from dsom_jax.types import Filter, Key, Proposal
 C = TypeVar("C")
 SCALED = ("runs", "worlds", "repeats")
 """Fields of configurations that ``--runs`` scales, in proportion to 100."""
+PROPOSALS = {
+    "dsom": ("DSOM", "#d62728"),
+    "likelihood_grid": ("likelihood grid", "#ff7f0e"),
+    "hybrid": ("hybrid", "#b5179e"),
+}
+"""Proposals that are compared: what figures call them, and their colours."""
 DIGITS = 6
 """Significant digits that are kept of every number."""
 
@@ -166,9 +172,17 @@ def write(path: Path, data: dict[str, Any]) -> None:
 
 
 def read(path: Path) -> dict[str, Any]:
-    """What :func:`write` wrote."""
-    found: dict[str, Any] = json.loads(path.read_text())
+    """What :func:`write` wrote; UserError for anything else."""
+    try:
+        found: dict[str, Any] = json.loads(path.read_text())
+    except (OSError, ValueError):
+        raise UserError(f"{path}: not a result of these experiments; delete it and run again") from None
     return found
+
+
+def result_path(folder: Path, piece: str, job: str) -> Path:
+    """Where the numbers of a job are kept."""
+    return folder / f"{piece}.{job.replace(' ', '_')}.json"
 
 
 def _rounded(data: Any) -> Any:

@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from lab import Everything, Lab, Piece, compiled
+from lab import PROPOSALS, Everything, Lab, Piece, compiled
 from matplotlib.figure import Figure
 from scenes import WORLD, Change, Condition, building, take
 from symmetric import images, off_middle, symmetric
@@ -28,11 +28,8 @@ from dsom_jax.training import quality
 from dsom_jax.types import Array, Inputs, Proposal
 
 NAME = "multimodal"
-PROPOSALS = ("dsom", "likelihood_grid", "hybrid")
 _UNSEEN = 0x3A5E
 """Folded into the seed, so that these buildings are none that anything else draws."""
-PICTURED = {0: "1", 2: "2", 4: "3 or more"}
-"""Sequence -> number of peaks of the first scan of it that is shown."""
 DRAWN = 1e-4
 """Cells of a picture are kept if they have this share of the most probable one's probability."""
 
@@ -64,23 +61,35 @@ def proposals(lab: Lab, grid: OccupancyGrid) -> dict[str, Proposal]:
 
 
 def judge_scenes(config: Config, lab: Lab) -> dict[str, Any]:
-    """Numbers of peaks on the test sequences, and pictures of scans with one, two, and more peaks."""
+    """Numbers of peaks on the test sequences, and pictures of typical scans with one, two, and more peaks."""
     counts: dict[str, list[int]] = {name: [] for name in PROPOSALS}
     mass: dict[str, list[float]] = {name: [] for name in PROPOSALS}
-    pictures: dict[str, Any] = {}
+    scans: list[tuple[str, OccupancyGrid, Array, Array]] = []
     made: dict[str, dict[str, Proposal]] = {}
-    for sequence, (where, grid, episode) in enumerate(lab.suite.episodes):
+    for where, grid, episode in lab.suite.episodes:
         made[where] = made.get(where) or proposals(lab, grid)
         ranges, poses = episode.ranges[:: config.every], episode.poses[:: config.every]
         for name in PROPOSALS:
             found = quality.judge(made[where][name], grid, ranges, poses)
             counts[name] += np.asarray(found.peaks).tolist()
             mass[name] += np.asarray(found.mass).tolist()
-            for n, peaks in enumerate(np.asarray(found.peaks).tolist() if name == "dsom" else ()):
-                label = str(peaks) if peaks < 3 else "3 or more"
-                if PICTURED.get(sequence) == label and label not in pictures:
-                    pictures[label] = picture(made[where][name], grid, ranges[n], poses[n], lab.suite.lidar)
-    return {"peaks": counts, "mass": mass, "pictures": dict(sorted(pictures.items()))}
+        scans += [(where, grid, *scan) for scan in zip(ranges, poses, strict=True)]
+    shown = {label: scans[n] for label, n in typical(counts["dsom"], mass["dsom"]).items()}
+    pictures = {
+        label: picture(made[where]["dsom"], grid, seen, pose, lab.suite.lidar)
+        for label, (where, grid, seen, pose) in shown.items()
+    }
+    return {"peaks": counts, "mass": mass, "pictures": pictures}
+
+
+def typical(peaks: list[int], mass: list[float]) -> dict[str, int]:
+    """Of the scans with one, two, three or more peaks, the one whose probability at the truth is the median."""
+    chosen = {}
+    for label, low, high in (("1", 1, 1), ("2", 2, 2), ("3 or more", 3, quality.MAX_PEAKS)):
+        found = sorted((mass[n], n) for n, count in enumerate(peaks) if low <= count <= high)
+        if found:
+            chosen[label] = found[len(found) // 2][1]
+    return chosen
 
 
 def judge_order(order: int, config: Config, lab: Lab) -> dict[str, Any]:
@@ -180,15 +189,23 @@ def figures(everything: Everything) -> dict[str, Figure]:
     results, made = everything[NAME], {}
     if "scenes" in results:
         kept = results["scenes"]["pictures"].values()
-        titles = [f"{p['peaks']} peak{'s' * (p['peaks'] != 1)}, {100 * p['mass']:.0f} % at the truth" for p in kept]
+        titles = [f"{plural(p['peaks'], 'peak')}, {100 * p['mass']:.0f} % at the truth" for p in kept]
         made["scenes"] = plotting.map_views([view(p) for p in kept], titles)
         made["peaks"] = histogram(results["scenes"]["peaks"])
     orders = [entry for name, entry in results.items() if name != "scenes"]
     if orders:
         kept = [next(iter(entry["pictures"].values())) for entry in orders]
-        titles = [f"order {entry['order']}: {p['peaks']} peaks" for entry, p in zip(orders, kept, strict=True)]
+        titles = [
+            f"{plural(entry['order'], 'right pose')}: {plural(p['peaks'], 'peak')}"
+            for entry, p in zip(orders, kept, strict=True)
+        ]
         made["symmetric"] = plotting.map_views([view(p) for p in kept], titles)
     return made
+
+
+def plural(count: int, what: str) -> str:
+    """``1 peak``, ``2 peaks``."""
+    return f"{count} {what}{'s' * (count != 1)}"
 
 
 def histogram(counts: dict[str, list[int]]) -> Figure:
@@ -198,15 +215,12 @@ def histogram(counts: dict[str, list[int]]) -> Figure:
     numbers = np.arange(1, quality.MAX_PEAKS + 1)
     for n, (name, peaks) in enumerate(counts.items()):
         share = [100 * np.mean(np.array(peaks) == k) for k in numbers]
-        ax.bar(numbers + 0.27 * (n - 1), share, width=0.25, color=COLORS[name], label=name.replace("_", " "))
+        ax.bar(numbers + 0.27 * (n - 1), share, width=0.25, color=PROPOSALS[name][1], label=PROPOSALS[name][0])
     ax.set(xlabel=f"peaks of PM ({quality.MAX_PEAKS}: as many or more)", ylabel="share of the test scans [%]")
     ax.set_xticks(numbers)
     handles, labels = ax.get_legend_handles_labels()
     legend(figure, handles, labels, 3)
     return figure
-
-
-COLORS = {"dsom": "#d62728", "likelihood_grid": "#ff7f0e", "hybrid": "#b5179e"}
 
 
 def section(everything: Everything) -> str:
@@ -226,8 +240,9 @@ def section(everything: Everything) -> str:
 
 SCENES = """\
 A peak is a place (apart from others by more than 2 m or 30 deg) that has at least a tenth of the probability of the
-best place within 1 m and 15 deg. The pictures are of the first scans of sequences 1, 3 and 5 on which PM of DSOM has
-one, two, and three or more peaks; PM as the network gives it, not sharpened.
+best place within 1 m and 15 deg. The pictures are of typical scans of the test sequences on which PM of DSOM has one,
+two, and three or more peaks: of all such scans those whose probability at the truth (within 1 m and 15 deg) is the
+median. PM as the network gives it, not sharpened.
 
 ![Three scenes](FIGURES/scenes.png)
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from lab import Everything, Lab, Piece, column
+from lab import PROPOSALS, Everything, Lab, Piece, column
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scenes import Change, Condition, Scans, beams_of, map_and_building, take
@@ -23,7 +23,6 @@ from dsom_jax.training import quality
 from dsom_jax.types import Key
 
 NAME = "one_scan"
-PROPOSALS = ("dsom", "likelihood_grid", "hybrid")
 _UNSEEN = 0x0E5C
 """Folded into the seed, so that these buildings are none that anything else draws."""
 
@@ -149,8 +148,7 @@ def told(parts: list[quality.Quality]) -> dict[str, Any]:
 
 
 SHOWN = {"mass_mean": "mean PM at the truth [%]", "mass_gt_1pct": "scans with > 1 % [%]", "top1": "top-1 right [%]"}
-STYLES = {"dsom": ("DSOM", "#d62728", "o-"), "likelihood_grid": ("likelihood grid", "#ff7f0e", "s--"),
-          "hybrid": ("hybrid", "#b5179e", "^:")}  # fmt: skip
+LINES = {"dsom": "o-", "likelihood_grid": "s--", "hybrid": "^:"}
 
 
 def figures(everything: Everything) -> dict[str, Figure]:
@@ -176,7 +174,7 @@ def _rows(curves: dict[str, Any]) -> Figure:
 
 
 def _curve(ax: Axes, curve: dict[str, Any], name: str, key: str) -> None:
-    label, color, style = STYLES[name]
+    (label, color), style = PROPOSALS[name], LINES[name]
     points = [point[name] for point in curve["points"]]
     low, high = (100 * column([point[f"{key}_ci95"][n] for point in points]) for n in (0, 1))
     ax.plot(curve["values"], 100 * column([p[key] for p in points]), style, color=color, markersize=4, label=label)
@@ -186,7 +184,7 @@ def _curve(ax: Axes, curve: dict[str, Any], name: str, key: str) -> None:
 def section(everything: Everything) -> str:
     """All points in one table, and the figures."""
     head = ["condition", "beams off %"]
-    head += [f"{STYLES[name][0]}: mass / > 1 % / top-1 %" for name in PROPOSALS]
+    head += [f"{PROPOSALS[name][0]}: mass / > 1 % / top-1 %" for name in PROPOSALS]
     lines = []
     for name in AXES:
         curve = everything[NAME].get(name, {"values": (), "points": ()})

@@ -65,13 +65,5 @@ SECONDS = {
 }
 """Inference of one iteration."""
 
-MAP_METRES = Quoted(43.0, "Sec V-A")
-"""Side of the synthetic maps; 20 of them, 18 to train on."""
-EXPERIMENTS = Quoted(600, "Sec V-C")
-"""6 sequences x 100 runs for each method and phase."""
-MCL_RANDOM = Quoted(0.2, "Sec V-A")
-"""Random sampling rate of MCL."""
 BASELINES = ("mcl", "mixture_mcl", "mixture_mcl_star", "pfrnn", "pf_net")
 """Sec V-A; Mixture MCL* cheats: its samples contain the test sequence."""
-ABLATION = ("mcl", "mixture_mcl_star", "mixture_mcl_dsom", "adam_dsom")
-"""Fig 5."""

@@ -11,7 +11,7 @@ import numpy as np
 import paper
 from departures import Part, Scene, departures
 from kept_runs import rows
-from lab import Everything, Lab, Piece, column
+from lab import PROPOSALS, Everything, Lab, Piece, column
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from side_by_side import other_t_cut, run_all
@@ -67,7 +67,7 @@ def scene_of(lab: Lab, filter: Any, where: str, episode: Episode) -> Scene:
     """PM and trust at the truth, for every scan of a sequence."""
     grid = next(g for name, g, _ in lab.suite.episodes if name == where)
     found = quality.judge(filter.proposal, grid, episode.ranges, episode.poses)
-    scored = lab.build("adam_likelihood_grid", where, grid, episode)
+    scored = lab.build("mcl", where, grid, episode)  # Its weights are those of Alg 1.
     return Scene(np.asarray(found.mass), np.asarray(trusts(scored, episode.poses, episode.ranges)))
 
 
@@ -89,8 +89,6 @@ def told(parts: list[Part], t_cut: float | None) -> dict[str, Any]:
     return {"summary": summaries, "runs": rows(join(found)), "departures": departures(parts, t_cut)}
 
 
-LABELS = {"dsom": "DSOM", "likelihood_grid": "likelihood grid", "hybrid": "hybrid"}
-COLORS = {"dsom": "#d62728", "likelihood_grid": "#ff7f0e", "hybrid": "#b5179e"}
 PHASES = {"global": "Global localization", "kidnap": "Kidnapping"}
 UNITS = {"e_pos_m": ("e_pos", "mean final $E_{pos}$ [m]"), "e_theta_rad": ("e_theta", r"mean final $E_\theta$ [rad]")}
 
@@ -107,7 +105,7 @@ def errors_by_t_cut(everything: Everything) -> Figure:
     figure, grid = panels(2)
     for axes, (key, (which, label)) in zip(grid, UNITS.items(), strict=True):
         for ax, (phase, title) in zip(axes, PHASES.items(), strict=True):
-            _curve(ax, found, phase, key, f"{which}_ci95", "AdaM + DSOM, ours", COLORS["dsom"])
+            _curve(ax, found, phase, key, f"{which}_ci95", "AdaM + DSOM, ours", PROPOSALS["dsom"][1])
             theirs = [row.of(phase, which) for row in paper.T_CUT.values()]
             ax.plot(list(paper.T_CUT), theirs, "ks--", markersize=4, linewidth=1, label="paper, Table I")
             ax.set(title=title, yscale="log", xlabel="$T_{cut}$", ylabel=label)
@@ -123,14 +121,13 @@ def kept_by_t_cut(everything: Everything) -> Figure:
     for ax, (phase, title) in zip(axes, PHASES.items(), strict=True):
         for name, entry in everything[NAME].items():
             algorithm, proposal = COMBINATIONS[name]
-            color = COLORS.get(proposal, "0.5")
+            label, color = PROPOSALS[proposal]
             if algorithm == "adam":
-                _curve(ax, entry["by_t_cut"], phase, "retention", "retention_ci95",
-                       f"Alg 1 + {LABELS[proposal]}", color, 100)  # fmt: skip
+                _curve(ax, entry["by_t_cut"], phase, "retention", "retention_ci95", f"Alg 1 + {label}", color, 100)
             else:
                 kept = entry["by_t_cut"]["-"]["summary"][phase]["retention"]
                 ax.axhline(100 * (np.nan if kept is None else kept), color=color, linestyle=":", linewidth=1.5,
-                           label=f"robust + {LABELS[proposal]}")  # fmt: skip
+                           label=f"robust + {label}")  # fmt: skip
         ax.set(title=title, xlabel="$T_{cut}$", ylabel="updates kept after convergence [%]")
         _finish(ax)
     handles, labels = axes[0].get_legend_handles_labels()

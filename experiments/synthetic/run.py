@@ -1,15 +1,18 @@
 """The synthetic report: ``python experiments/synthetic/run.py [--only comparison ...] [--runs 100] [--force]``.
 
-From the networks in ``checkpoints``, on two cores in about 40 minutes. Every job writes
-``results/PIECE.JOB.json``; what exists is kept, so that an interrupted run continues where it was. Figures (PNG and
-PDF) and ``experiments/REPORT.md`` are made from these files at the end.
+From the networks in ``checkpoints``, on two cores in about 40 minutes; ``--runs 20`` is a look at all of it in less.
+Every job writes ``results/PIECE.JOB.json``; what exists is kept, so that an interrupted run continues where it was, and
+a job that fails does not keep the others from being run. Figures (PNG and PDF) and ``experiments/REPORT.md`` are made
+from these files at the end.
 """
 
 from __future__ import annotations
 
 import os
+import traceback
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import comparison
 import cost
@@ -20,7 +23,7 @@ import one_scan
 import particles
 import retention
 import write_report
-from lab import Lab, Piece, measured, read, scaled, write
+from lab import Job, Lab, Piece, measured, read, result_path, scaled, write
 
 from dsom_jax import report
 from dsom_jax.cli import parse
@@ -39,7 +42,7 @@ class Args:
     only: tuple[str, ...] = ()
     """Pieces to run, or jobs as PIECE.JOB; default: all. The report is written from all results there are."""
     runs: int = 100
-    """Monte-Carlo runs of each method on each sequence; other pieces and their numbers of scans in proportion."""
+    """Monte-Carlo runs of each method on each sequence; runs, buildings, repeats of other pieces in proportion."""
     seed: int = 0
     """Seed of all randomness."""
     out: Path | None = None
@@ -55,12 +58,15 @@ def main() -> None:
     out = report.output_folder(args.out or HERE)
     (out / "results").mkdir(exist_ok=True)
     lab = Lab(args.seed)
+    failed = []
     for piece in PIECES:
-        run_piece(piece, lab, args, out / "results")
+        failed += run_piece(piece, lab, args, out / "results")
         jax.clear_caches()  # Every filter compiles anew, and what is compiled takes memory.
     page = out / "REPORT.md" if args.out else HERE.parent / "REPORT.md"
     write_report.write(PIECES, out / "results", out / "figures", page)
     print(f"{os.path.relpath(page)}: written")
+    if failed:
+        raise UserError(f"{', '.join(failed)}: failed, see above; the same command tries again what is missing")
 
 
 def check(args: Args) -> None:
@@ -75,21 +81,38 @@ def check(args: Args) -> None:
         raise UserError(f"--runs {args.runs}: give at least 1 and at most 10000")
 
 
-def run_piece(piece: Piece, lab: Lab, args: Args, folder: Path) -> None:
-    """The jobs of one piece that are asked for and missing."""
-    config = scaled(piece.config, args.runs)
+def run_piece(piece: Piece, lab: Lab, args: Args, folder: Path) -> list[str]:
+    """Run the jobs of one piece that are asked for and missing; the names of those that failed."""
+    config, failed = scaled(piece.config, args.runs), []
     for name, job in piece.jobs(config).items():
-        full, path = f"{piece.name}.{name}", folder / f"{piece.name}.{name.replace(' ', '_')}.json"
+        full, path = f"{piece.name}.{name}", result_path(folder, piece.name, name)
         if args.only and not {piece.name, full} & set(args.only):
             continue
         if path.exists() and not args.force:
-            same = read(path)["made"]["config"] == report.plain(asdict(config))
+            made = read(path)["made"]
+            same = (made["config"], made["seed"]) == (report.plain(asdict(config)), lab.seed)
             print(f"{full}: kept" + ("" if same else ", made with other settings (--force)"), flush=True)
-            continue
+        elif not run_job(full, path, job, lab, config):
+            failed.append(full)
+    return failed
+
+
+def run_job(full: str, path: Path, job: Job, lab: Lab, config: Any) -> bool:
+    """Run one job and keep its numbers; False, and why on the terminal, if it failed."""
+    print(f"{full}: ...", flush=True)
+    try:
         data = measured(job, lab, config)
-        write(path, data)
-        made = read(path)["made"]
-        print(f"{full}: {made['wall_s']:.0f} s, {made['processor_s']:.0f} s of processor time", flush=True)
+    except UserError as error:
+        print(f"{full}: failed: {error}", flush=True)
+        return False
+    except Exception:  # Whatever it is, the jobs after it are not concerned.
+        traceback.print_exc()
+        print(f"{full}: failed", flush=True)
+        return False
+    write(path, data)
+    made = data["made"]
+    print(f"{full}: {made['wall_s']:.0f} s, {made['processor_s']:.0f} s of processor time", flush=True)
+    return True
 
 
 if __name__ == "__main__":

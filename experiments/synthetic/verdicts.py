@@ -46,9 +46,15 @@ def verdicts(everything: Everything) -> list[Verdict]:
 
 
 def runs_of(everything: Everything) -> RunTable | None:
-    """Every run of the comparison."""
+    """The runs of the comparison that all its methods have."""
     results = everything.get(comparison.NAME, {})
-    return comparison.table_of(results) if results else None
+    return shared([table(name, entry["runs"]) for name, entry in results.items()]) if results else None
+
+
+def shared(tables: Sequence[RunTable]) -> RunTable:
+    """The runs that all of ``tables`` have: those of the same keys, whatever numbers of runs were asked for."""
+    count = min(int(side.run.max()) for side in tables)
+    return join([side.rows(side.run <= count) for side in tables])
 
 
 def compare(
@@ -165,19 +171,13 @@ def more_particles(everything: Everything) -> Claim:
     found, evidence = particles.by_count(everything) if particles.NAME in everything else {}, []
     counts = sorted(found)
     for few, many in pairwise(counts):
-        both = join([table(str(n), _first(found[n]["runs"], found[many]["runs"])) for n in (few, many)])
+        both = shared([table(str(n), found[n]["runs"]) for n in (few, many)])
         for phase in PHASES:
             a, b = paired(both, str(many), str(few), phase)
             kept = a.converged & b.converged
             what = f"final E_pos [m], {many} - {few} particles, {NAMES[phase]}"
             evidence.append(value_evidence(what, a.e_pos_m[kept], b.e_pos_m[kept], a.sequence[kept]))
     return "More particles give smaller errors (Table II)", evidence
-
-
-def _first(runs: dict[str, list[Any]], like: dict[str, list[Any]]) -> dict[str, list[Any]]:
-    """Those of the runs that were also made in ``like``: the same keys."""
-    kept = [n for n, run in enumerate(runs["run"]) if run <= max(like["run"])]
-    return {name: [values[n] for n in kept] for name, values in runs.items()}
 
 
 def insensitive(everything: Everything) -> Claim:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import verdicts
-from lab import Everything, Piece, Results, read
+from lab import Everything, Piece, Results, read, result_path
 from tables import markdown, number
 
 from dsom_jax import plotting
@@ -29,15 +29,14 @@ HEAD = """\
 Written by `python experiments/synthetic/run.py` from the shipped checkpoints; do not edit. The paper is Chen et al.,
 RA-L 2021; its numbers and where they stand are in [synthetic/paper.py](synthetic/paper.py). Real logs:
 [real/REPORT.md](real/REPORT.md). The paper's own real data (UPO, Bicocca) are not here and were not run
-([paper_data](paper_data/README.md)).
-"""
+([paper_data](paper_data/README.md))."""
 
 
 def gather(pieces: Sequence[Piece], folder: Path) -> dict[str, dict[str, Any]]:
     """The results of all jobs that there are, in the order of the pieces and their jobs."""
     found: dict[str, dict[str, Any]] = {}
     for piece in pieces:
-        paths = {job: folder / f"{piece.name}.{job.replace(' ', '_')}.json" for job in piece.jobs(piece.config)}
+        paths = {job: result_path(folder, piece.name, job) for job in piece.jobs(piece.config)}
         jobs = {job: read(path) for job, path in paths.items() if path.exists()}
         if jobs:
             found[piece.name] = jobs

@@ -165,7 +165,7 @@ class Evidence:
         test = "" if self.p is None else f", p {self.p:.2g}"
         sign = "<" if self.wanted == "less" else ">"
         interval = f"{self.estimate:.3g} [{self.low:.3g}, {self.high:.3g}]"
-        return f"{self.what}: {interval} {sign} {self.bound:g}{test}: {self.status()}"
+        return f"{self.what}: {interval}, claimed {sign} {self.bound:g}{test}: {self.status()}"
 
 
 @dataclass(frozen=True)

@@ -105,7 +105,7 @@ def band_evolution(bands: Sequence[Mapping[str, Band]], kidnapped: Sequence[Sequ
             _band(ax, band, _color(name), _label(name))
         for t in moved:
             ax.axvline(t, color="black", linestyle=":", linewidth=1, label="kidnapped")
-        ax.axhline(2.0, color="0.5", linewidth=0.8, linestyle="--")
+        ax.axhline(2.0, color="0.5", linewidth=0.8, linestyle="--", label="2 m")
         last = max((len(band["mean"]) for band in methods.values()), default=1) - 1
         ax.set(yscale="log", xlabel="update", title=f"sequence {number + 1}", xlim=(0, last))
         _metre_ticks(ax)

@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.transforms import Affine2D
 
@@ -21,6 +22,8 @@ from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.plotting.common import legend, panels
 from dsom_jax.pose_grid import ProbabilityMap
 from dsom_jax.types import Filter, Inputs, Proposal
+
+SCAN_COLOR = "#1f77b4"
 
 
 def map_view(
@@ -45,7 +48,7 @@ def map_view(
     if pm is not None:
         _draw_pm(ax, pm, grid.origin if pm_origin is None else pm_origin, pm_resolution or grid.resolution)
     if points is not None:
-        ax.plot(*np.asarray(points).T, ".", color="#1f77b4", markersize=2.5, label="scan", zorder=3)
+        ax.plot(*np.asarray(points).T, ".", color=SCAN_COLOR, markersize=2.5, label="scan", zorder=3)
     if particles is not None:
         _arrows(ax, particles, "#2a7f3f", 1.0, "particles", alpha=0.5)
     if truth is not None:
@@ -63,6 +66,8 @@ def map_views(views: Sequence[Mapping[str, Any]], titles: Sequence[str]) -> Figu
         ax.set_title(title)
         ax.label_outer()
     named = {label: handle for ax in axes for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
+    if "scan" in named:  # Dots as small as on the map are not to be seen in a legend.
+        named["scan"] = Line2D([], [], linestyle="", marker=".", color=SCAN_COLOR, markersize=7)
     if any(view.get("pm") is not None for view in views):
         named["PM (summed over headings, 4 decades)"] = Patch(color="#fd8d3c")
     legend(figure, list(named.values()), list(named), columns=max(len(named), 1))
