@@ -1,8 +1,7 @@
 """What all tests share: how they compile, and which examples hypothesis draws.
 
-Nearly all of the time goes into compiling. Half of that is optimisation, which problems this small do not repay: it is
-left out, except where a test asks for it (``optimised``). What is compiled is kept for the other workers and for the
-processes that tests start, in a folder of this run alone: no test meets anything that an older run has left.
+Nearly all of the time goes into compiling. What is compiled is kept for the other workers and for the processes that
+tests start, in a folder of this run alone: no test meets anything that an older run has left.
 """
 
 from __future__ import annotations
@@ -15,7 +14,6 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 # All of this before JAX is imported; workers and processes that tests start inherit it.
-os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 OWN_CACHE = None if "JAX_COMPILATION_CACHE_DIR" in os.environ else tempfile.mkdtemp(prefix="dsom-tests-")
 if OWN_CACHE:
@@ -47,14 +45,3 @@ def _small_blocks():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("dsom_jax.proposals.likelihood_grid._BLOCK", 512)
         yield
-
-
-@pytest.fixture(scope="module")
-def optimised():
-    """Compilation as users have it: for promises about bits, and for accuracy."""
-    import jax
-
-    before = jax.config.values["jax_disable_most_optimizations"]
-    jax.config.update("jax_disable_most_optimizations", False)
-    yield
-    jax.config.update("jax_disable_most_optimizations", before)

@@ -177,7 +177,7 @@ def test_shares_of_grid_and_particles(filters):
     assert float(belief.sum()) == pytest.approx(1.0, abs=1e-5)
 
 
-def test_it_finds_the_robot_keeps_it_and_run_r_is_the_run_alone(filters, optimised):
+def test_it_finds_the_robot_keeps_it_and_run_r_is_the_run_alone(filters):
     episode = tiny_world.drive()
     keys = run_keys(3, 0, 6)
     info = run(filters[0], episode, keys).info

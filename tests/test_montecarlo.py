@@ -19,8 +19,6 @@ from dsom_jax.episode import Episode
 from dsom_jax.resampling import resample
 from dsom_jax.types import Inputs
 
-pytestmark = pytest.mark.usefixtures("optimised")
-
 
 class Info(NamedTuple):
     mean: Any

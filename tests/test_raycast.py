@@ -20,7 +20,6 @@ from dsom_jax.occupancy import from_cells
 from dsom_jax.raycast import RaycastConfig, make_tables
 from reference import rays
 
-pytestmark = pytest.mark.usefixtures("optimised")
 cast_rays = jax.jit(raycast.cast_rays, static_argnums=2)
 EXACT = RaycastConfig("exact")
 CELLS = 2e-3  # promised accuracy, and the clearance of corners below which no side can be told

@@ -20,7 +20,6 @@ from dsom_jax.training.loop import (
     make_step,
 )
 
-pytestmark = pytest.mark.usefixtures("optimised")
 SCAN = ScanConfig(beams=36, reach_min=5.0, obstacles=(0, 0))
 CONFIG = TrainConfig(
     model=DSOMConfig(width=4, headings=8, fov_min=SCAN.fov_min, reach_min=SCAN.reach_min),
