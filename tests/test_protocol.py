@@ -68,7 +68,7 @@ def test_a_map_replaces_what_it_names():
     plan = Plan(maps={"a": {"yaml": "a.yaml", "logs": ["x.log"], "adapt": {"seed": 3}}, "b": {"yaml": "b.yaml"}},
                 logs=("all.log",), adapt={"seed": 1, "warmup": 5})  # fmt: skip
     own, fields = plan.on("a")
-    assert (own.logs, own.adapt, fields) == (("x.log",), {"seed": 3}, {"yaml": "a.yaml"})
+    assert (own.logs, own.adapt, fields) == (("x.log",), {"seed": 3, "warmup": 5}, {"yaml": "a.yaml"})
     assert plan.on("b")[0].logs == ("all.log",) and plan.on("b")[0].adapt == plan.adapt
 
 

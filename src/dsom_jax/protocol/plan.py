@@ -32,7 +32,8 @@ class Plan:
         name: of the data set.
         maps: name -> ``yaml``, the map's file in the data folder, or the fields of one (``image`` or ``drawing``,
             relative to the data folder). A drawing may have ``box``: [left, top, right, bottom] in metres from its
-            upper left corner, in place of ``crop``. ``logs``, ``map_kind`` and ``adapt`` of a map replace those below.
+            upper left corner, in place of ``crop``. ``logs`` and ``map_kind`` of a map replace those below,
+            ``adapt`` adds to it.
         logs: patterns of files or folders in the data folder; FILE.tum beside FILE is its reference, if it is there.
         scan_topic, odom_topic: of bags; empty where there is no choice.
         methods: names as in the benchmark; ``NAME@shipped`` takes a network as it is shipped.
@@ -71,10 +72,10 @@ class Plan:
     def on(self, name: str) -> tuple[Plan, dict[str, Any]]:
         """The plan of one map with what it replaces, and the fields that describe the map itself."""
         fields = dict(self.maps[name])
-        own = {key: fields.pop(key) for key in ("logs", "map_kind", "adapt") if key in fields}
-        return override(
-            replace(self, logs=(), adapt={}), {"logs": list(self.logs), "adapt": self.adapt, **own}, name
-        ), fields
+        own = {key: fields.pop(key) for key in ("logs", "map_kind") if key in fields}
+        own["adapt"] = self.adapt | fields.pop("adapt", {})
+        # An empty tuple or mapping takes any.
+        return override(replace(self, logs=(), adapt={}), {"logs": list(self.logs), **own}, name), fields
 
 
 @dataclass(frozen=True)
