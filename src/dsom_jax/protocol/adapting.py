@@ -36,8 +36,8 @@ def adapt(plan: Plan, map_yaml: Path, start: Path, lidar: LidarConfig, folder: P
         return start
     config = folder.with_suffix(".yaml")
     write_atomic(config, yaml.safe_dump(settings(start, lidar, plan.adapt)).encode())
-    words = ["--maps", map_yaml, "--init", start, "--minutes", plan.adapt_minutes, "--out", folder, "--resume"]
-    words += ["--config", config]
+    length = ("--steps", plan.adapt_steps) if plan.adapt_steps else ("--minutes", plan.adapt_minutes)
+    words = ["--maps", map_yaml, "--init", start, "--config", config, *length, "--out", folder, "--resume"]
     done = subprocess.run([sys.executable, "-m", "dsom_jax.train", *map(str, words)])
     if done.returncode:
         raise UserError(f"{folder}: training on {map_yaml.name} failed; its message is above")

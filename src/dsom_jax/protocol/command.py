@@ -34,6 +34,8 @@ class Args:
     """Network to start from; default: the one in the repository."""
     adapt_minutes: float | None = None
     """Minutes of training on each map, in place of the configuration's; 0 takes the network as it is."""
+    adapt_steps: int | None = None
+    """Steps of that training in place of minutes."""
     runs: int | None = None
     """Monte-Carlo runs of each clip, in place of the configuration's."""
     only: tuple[str, ...] = ()
@@ -42,7 +44,7 @@ class Args:
 
 def main(args: Args) -> None:
     """All maps of a configuration."""
-    plan = read_plan(args.config, {"runs": args.runs, "adapt_minutes": args.adapt_minutes})
+    plan = read_plan(args.config, {name: getattr(args, name) for name in ("runs", "adapt_minutes", "adapt_steps")})
     if not args.data.is_dir():
         raise UserError(f"--data {args.data}: no such folder; name the folder of the data set")
     if set(args.only) - set(plan.maps):
@@ -71,7 +73,8 @@ def run_map(plan: Plan, suite: Suite, map_yaml: Path, start: Path | None, name: 
 
     @cache
     def adapted() -> Path | None:
-        return start and adapt(plan, map_yaml, start, suite.lidar, work / "networks" / name)
+        length = f"{plan.adapt_steps}-steps" if plan.adapt_steps else f"{plan.adapt_minutes:g}-min"
+        return start and adapt(plan, map_yaml, start, suite.lidar, work / "networks" / f"{name}-{length}")
 
     def network(variant: Variant) -> Path | None:
         kind = network_of(variant.method)

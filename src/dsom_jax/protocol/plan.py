@@ -43,7 +43,8 @@ class Plan:
         clips: drives chosen from all logs together, each of ``updates`` updates.
         on_map: share of a clip's reference that must lie on free cells.
         laser_max_range: metres; longer readings count as no return.
-        adapt_minutes: of training on each map before it is used, where a method needs the network.
+        adapt_minutes: of training on each map before it is used, where a method needs the network; 0 for none.
+        adapt_steps: of that training in place of minutes, so that any machine does the same; 0 goes by the clock.
         adapt: fields of ``TrainConfig`` for that training that differ from those of :func:`.adapting.settings`.
     """
 
@@ -64,6 +65,7 @@ class Plan:
     on_map: float = 0.95
     laser_max_range: float = 30.0
     adapt_minutes: float = 30.0
+    adapt_steps: int = 0
     adapt: dict[str, Any] = field(default_factory=dict)
 
     def on(self, name: str) -> tuple[Plan, dict[str, Any]]:

@@ -26,7 +26,7 @@ Every clip starts without any prior on the pose; at its end the robot is carried
   within [Wilson, runs as trials]; strict: last estimate within 0.5 m and 5 deg
 - sure and wrong: updates at which the filter claims to know (lost < 5 %) and is not within 2 m and 10 deg
 - the paper's filters are judged by the weighted mean of the particles, robust ones by the heaviest cluster
-- network: adapted to the map by minutes of training in it, or as shipped
+- network: as shipped, or trained on in this map for so long
 """
 
 
@@ -63,21 +63,27 @@ def made_with(entries: dict[Variant, dict[str, Any]]) -> str:
 def table(entries: dict[Variant, dict[str, Any]], phase: str) -> str:
     """Markdown table of one phase."""
     rows = [COLUMNS, ("---", "---", *["---:"] * (len(COLUMNS) - 2))]
-    rows += [row(variant, entry[phase]) for variant, entry in entries.items()]
+    rows += [row(variant, network_of(entry), entry[phase]) for variant, entry in entries.items()]
     lines = ["| " + " | ".join(cells) + " |" for cells in rows]
     return f"**{PHASES[phase]}**\n\n" + "\n".join(lines) + "\n"
 
 
-def row(variant: Variant, m: dict[str, Any]) -> tuple[str, ...]:
-    """Cells of one variant."""
-    drawn = "dsom" in variant.method or "hybrid" in variant.method
-    network = ("shipped" if variant.shipped else "adapted") if drawn else ""
+def row(variant: Variant, origin: str, m: dict[str, Any]) -> tuple[str, ...]:
+    """Cells of one variant, ``origin`` that of its network."""
     return (
-        f"`{variant.method}`", network, "" if variant.t_cut is None else f"{variant.t_cut:g}",
+        f"`{variant.method}`", origin, "" if variant.t_cut is None else f"{variant.t_cut:g}",
         rate(m, "converged"), number(m["steps_median"], "{:g}"),
         number(m["e_pos_m"], "{:.3f}") + interval(m["e_pos_ci95"], "{:.3f}", 1),
         rate(m, "retention"), number(m["strict_success"], "{:.1f}", 100), number(m["false_confident"], "{:.1f}", 100),
     )  # fmt: skip
+
+
+def network_of(entry: dict[str, Any]) -> str:
+    """Where the network of a result comes from, for a cell."""
+    facts = entry.get("network")
+    if not facts:
+        return ""
+    return "shipped" if facts["shipped"] else f"{facts['seconds'] / 60:.0f} min, {facts['samples']} scans"
 
 
 def rate(m: dict[str, Any], name: str) -> str:

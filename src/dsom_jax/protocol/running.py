@@ -61,13 +61,29 @@ def run_variant(variant: Variant, plan: Plan, suite: Suite, build: Builder, out:
     entry = bench.summary(suite, {variant.method: record}, shared)["methods"][variant.method]
     draw(variant, suite, record, work)
     save_runs(work / f"{variant.stem}.npz", record, variant.stem)
-    facts = {"variant": variant.name, "t_cut": variant.t_cut, **identity(plan, suite), "commit": commit()}
+    facts = {"variant": variant.name, "t_cut": variant.t_cut, **identity(variant, plan, suite), "commit": commit()}
+    facts["network"] = network_facts(build.networks(variant), variant)
     report.write_json(out / f"{variant.stem}.json", facts | entry)
 
 
-def identity(plan: Plan, suite: Suite) -> dict[str, Any]:
-    """What must be the same for a result to be kept."""
+def network_facts(folder: Path | None, variant: Variant) -> dict[str, Any] | None:
+    """What a variant draws from: which maps it was last trained on, and how long; None without a network."""
+    kind = network_of(variant.method)
+    if folder is None or kind is None:
+        return None
+    record = checkpoint.load_provenance(folder, kind)
+    shipped = folder == checkpoint.shipped(kind)
     return {
+        "shipped": shipped,
+        **{name: record.get(name) for name in ("data", "steps", "samples", "seconds", "commit")},
+    }
+
+
+def identity(variant: Variant, plan: Plan, suite: Suite) -> dict[str, Any]:
+    """What must be the same for a result to be kept."""
+    adapted = network_of(variant.method) == "dsom" and not variant.shipped
+    training = {"adapt_minutes": plan.adapt_minutes, "adapt_steps": plan.adapt_steps, "adapt": plan.adapt}
+    return (training if adapted else {}) | {
         "suite": suite.name, "map_kind": plan.map_kind, "runs": plan.runs, "particles": plan.particles,
         "clips": plan.clips, "updates": plan.updates, "seed": plan.seed, "laser_max_range": plan.laser_max_range,
     }  # fmt: skip
@@ -82,7 +98,7 @@ def is_done(variant: Variant, plan: Plan, suite: Suite, out: Path, work: Path) -
         found = json.loads(path.read_text())
     except json.JSONDecodeError as error:
         raise UserError(f"{path}: not JSON ({error}); delete it to have it made again") from None
-    return all(found.get(name) == value for name, value in identity(plan, suite).items())
+    return all(found.get(name) == value for name, value in identity(variant, plan, suite).items())
 
 
 def save_runs(path: Path, record: bench.Record, name: str) -> None:
