@@ -207,6 +207,54 @@ def test_the_page_is_made_from_results(folders, tmp_path):
     assert "FIGURES" not in text and "nan" not in text.lower()
 
 
+@pytest.fixture(scope="module")
+def everything() -> dict[str, Any]:
+    """Made results of the pieces that the comparison is not, as small as they can be."""
+    runs = {phase: [made_runs(n, 3, 0.1)] for n, phase in enumerate(comparison.PHASES)}
+    summary = {phase: summarize(pool(some)) for phase, some in runs.items()}
+    entry = {"summary": summary, "runs": kept_runs.rows(join([run_rows("x", p, 0, 0, r[0]) for p, r in runs.items()]))}
+    left = {key: 0.5 for key in ("per_100_updates", "dragged", "returned", "length_median")} | {"count": 3}
+    left |= {f"{key}{which}": 0.5 for key in ("pm_poor", "doubted", "redrawn") for which in ("", "_otherwise")}
+    keys = ("mass_mean", "mass_gt_1pct", "top1")
+    quality = {key: 0.5 for key in keys} | {f"{key}_ci95": [0.4, 0.6] for key in keys}
+    point = {name: quality for name in lab.PROPOSALS} | {"contradicting": 0.1}
+    seconds = dict.fromkeys(("median_s", "low_s", "high_s", "min_s", "processor_s"), 0.01)
+    size = dict.fromkeys(("arguments", "result", "between", "sum"), 10.0)
+    rows = [{"metres": m, "cells": 129, "free_m2": 900.0, "pm_mb": size, "pm": seconds, "map_first_s": 1.0,
+             "map_mb": size} for m in (43.0, 300.0)]  # fmt: skip
+    by_t_cut = {cut: entry | {"departures": left} for cut in ("0.1", "0.5")}
+    found: dict[str, Any] = {
+        "retention": {"adam_dsom": {"by_t_cut": by_t_cut},
+                      "robust_dsom": {"by_t_cut": {"-": entry | {"departures": left | {"doubted": None,
+                                                                                      "doubted_otherwise": None}}}}},
+        "particles": {"500": entry},
+        "odometry": {"adam_dsom": {"by_factor": {"1": summary, "2": summary}}},
+        "one_scan": {"fov": {"label": "field of view [deg]", "values": [90, 360], "names": ["90", "360"],
+                             "points": [point, point]}},
+        "cost": {"update": {"times": {"mcl": {"prepare": None, "step": seconds, "compiling_s": 1.0}}},
+                 "map_size": {"rows": rows}},
+    }  # fmt: skip
+    return {piece: {job: {"made": made({})} | entry for job, entry in jobs.items()} for piece, jobs in found.items()}
+
+
+def test_sections_show_the_figures_that_are_drawn(everything):
+    import run as script
+
+    for piece in script.PIECES:
+        if piece.name in everything:
+            text = piece.section(everything)
+            assert set(re.findall(r"FIGURES/(\w+)\.png", text)) == set(piece.figures(everything)), piece.name
+            assert "nan" not in text.lower() and "None" not in text, piece.name
+
+
+def test_typical_scans_are_medians():
+    import multimodal
+
+    chosen = multimodal.typical([1, 1, 1, 2, 4, 3, 3], [0.9, 0.1, 0.5, 0.3, 0.2, 0.8, 0.4])
+    assert chosen == {"1": 2, "2": 3, "3 or more": 6}
+    assert multimodal.typical([1], [0.2]) == {"1": 0}
+
+
 def test_numbers_survive_the_file(tmp_path):
     table = join([run_rows("mcl", "global", 0, 0, made_runs(1, 3, 0.1))])
     table.e_pos_m[0], table.retention[1] = np.inf, np.nan

@@ -20,6 +20,7 @@ from tables import markdown, number
 
 from dsom_jax.nn import encode_map
 from dsom_jax.occupancy import OccupancyGrid
+from dsom_jax.plotting.common import log_ticks
 from dsom_jax.proposals.dsom import dsom
 
 NAME = "cost"
@@ -137,7 +138,7 @@ def figures(everything: Everything) -> dict[str, Figure]:
     for ax in (left, right):
         ax.set_xticks(side, [f"{s:.0f}" for s in side])
         ax.minorticks_off()
-        ax.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+        log_ticks(ax.yaxis)
         ax.grid(color="0.9", linewidth=0.6)
         ax.legend(frameon=False, fontsize=8)
     return {"map_size": figure}

@@ -57,10 +57,12 @@ class Lab:
     Attributes:
         seed: of all randomness.
         sources: proposals that were made, by the name of the map.
+        scenes: what a proposal makes of a sequence, by its name and the sequence (:mod:`retention`).
     """
 
     seed: int = 0
     sources: dict[str, dict[str, Proposal]] = field(default_factory=dict)
+    scenes: dict[tuple[str, int], Any] = field(default_factory=dict)
 
     @cached_property
     def suite(self) -> Suite:

@@ -10,6 +10,7 @@ import numpy as np
 from lab import Everything, Lab, Piece, column
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MultipleLocator
 from side_by_side import noisier, run_all, with_error
 from tables import markdown, percent
 
@@ -70,6 +71,7 @@ def figures(everything: Everything) -> dict[str, Figure]:
         axes[0].set_ylabel(label)
     for ax in grid[-1]:
         ax.set_xlabel("error of the odometry, times that of the suite")
+        ax.xaxis.set_major_locator(MultipleLocator(1))
     handles, labels = grid[0][0].get_legend_handles_labels()
     legend(figure, handles, labels, 3)
     return {"odometry": figure}

@@ -29,11 +29,12 @@ _UNSEEN = 0x0E5C
 
 @dataclass(frozen=True)
 class Axis:
-    """One curve: what its abscissa is called, and the condition at a value of it."""
+    """One curve: what its abscissa is called, the condition at a value of it, and names of values that are no sizes."""
 
     label: str
     values: tuple[float, ...]
     condition: Callable[[float], Condition]
+    names: tuple[str, ...] = ()
 
 
 def changed(name: str) -> Callable[[float], Condition]:
@@ -58,8 +59,8 @@ AXES = {
     "deep": Axis("beams end behind walls [m]", (0.0, 0.1, 0.2, 0.3), changed("deep")),
     "symmetry": Axis("landmarks that break a 2-fold symmetry", (0, 1, 2, 4, 8, 16),
                      lambda v: Condition(landmarks=int(v))),
-    "floor plan": Axis("0 full map, 1 walls only, 2 walls only and known to be so", (0, 1, 2),
-                       lambda v: Condition(bare=v > 0, drawn=v > 1)),
+    "floor plan": Axis("what the map shows", (0, 1, 2), lambda v: Condition(bare=v > 0, drawn=v > 1),
+                       ("all", "walls", "walls, told")),
 }  # fmt: skip
 
 
@@ -89,7 +90,7 @@ class Bed:
 
     def curve(self, axis: Axis, lab: Lab) -> dict[str, Any]:
         """Every point of a curve."""
-        return {"label": axis.label, "values": axis.values,
+        return {"label": axis.label, "values": axis.values, "names": axis.names or [f"{v:g}" for v in axis.values],
                 "points": [self.point(axis.condition(value), lab) for value in axis.values]}  # fmt: skip
 
     def point(self, condition: Condition, lab: Lab) -> dict[str, Any]:
@@ -161,12 +162,14 @@ def figures(everything: Everything) -> dict[str, Figure]:
 
 def _rows(curves: dict[str, Any]) -> Figure:
     figure = Figure(figsize=(11, 2.7 * len(curves) + 0.5), layout="constrained")
+    figure.get_layout_engine().set(wspace=0.05)  # type: ignore[union-attr]  # it is the constrained one
     grid = figure.subplots(len(curves), len(SHOWN), squeeze=False, sharey=True)
     for axes, curve in zip(grid, curves.values(), strict=True):
         for ax, (key, label) in zip(axes, SHOWN.items(), strict=True):
             for name in PROPOSALS:
                 _curve(ax, curve, name, key)
             ax.set(xlabel=curve["label"], ylabel=label, ylim=(-3, 103))
+            ax.set_xticks(curve["values"], curve["names"])
             ax.grid(axis="y", color="0.9", linewidth=0.6)
     handles, labels = grid[0][0].get_legend_handles_labels()
     legend(figure, handles, labels, len(PROPOSALS))
@@ -187,10 +190,10 @@ def section(everything: Everything) -> str:
     head += [f"{PROPOSALS[name][0]}: mass / > 1 % / top-1 %" for name in PROPOSALS]
     lines = []
     for name in AXES:
-        curve = everything[NAME].get(name, {"values": (), "points": ()})
-        for value, point in zip(curve["values"], curve["points"], strict=True):
+        curve = everything[NAME].get(name, {"names": (), "points": ()})
+        for value, point in zip(curve["names"], curve["points"], strict=True):
             cells = [" / ".join(percent(point[p][key], 0) for key in SHOWN) for p in PROPOSALS]
-            lines.append([f"{curve['label']}: {value:g}", percent(point["contradicting"]), *cells])
+            lines.append([f"{curve['label']}: {value}", percent(point["contradicting"]), *cells])
     pictures = [f"![One scan, curves](FIGURES/{name}.png)" for name in figures(everything)]
     return "\n\n".join([TEXT, markdown(head, lines), *pictures])
 
@@ -202,6 +205,7 @@ the scans with at least that much there; top-1: the most probable pose is within
 beams of the full turn that end more than 0.3 m from where the map says, before noise. PM of DSOM is not sharpened.
 Shaded: 95 % bootstrap interval, buildings drawn first. Where walls stand elsewhere, the truth is the place on the map
 where what is around the robot is mapped. With symmetry there are two right poses until landmarks tell them apart, so
-that 50 % of PM at the truth is all that can be had without them."""
+that 50 % of PM at the truth is all that can be had without them. What the map shows: all, walls only, or walls only and
+the likelihood grid is told that the map is a floor plan."""
 
 PIECE = Piece(NAME, Config(), jobs, figures, section)

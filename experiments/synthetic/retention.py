@@ -22,7 +22,8 @@ from dsom_jax.bench import judge, judged_by
 from dsom_jax.episode import Episode
 from dsom_jax.filters.methods import COMBINATIONS
 from dsom_jax.montecarlo import run
-from dsom_jax.plotting.common import legend
+from dsom_jax.occupancy import OccupancyGrid
+from dsom_jax.plotting.common import legend, log_ticks
 from dsom_jax.run_table import RunTable, join, run_rows
 from dsom_jax.training import quality
 
@@ -56,16 +57,17 @@ def keep(name: str, config: Config, lab: Lab) -> dict[str, Any]:
         filter = lab.build(name, where, grid, episode, config.particles)
         keys = lab.keys(config.runs)[sequence]
         results = run_all(filter, other_t_cut, config.t_cuts, episode, keys) if adam else [run(filter, episode, keys)]
-        scene = scene_of(lab, filter, where, episode)
+        # Alg 1 and AdaM robust draw from the same proposals.
+        which = COMBINATIONS[name][1], sequence
+        scene = lab.scenes[which] = lab.scenes.get(which) or scene_of(lab, filter, where, grid, episode)
         for label, result in zip(labels, results, strict=True):
             parts[label].append(Part(name, sequence, episode, result, scene))
     cuts = config.t_cuts if adam else (None,)
     return {"by_t_cut": {label: told(found, cut) for (label, found), cut in zip(parts.items(), cuts, strict=True)}}
 
 
-def scene_of(lab: Lab, filter: Any, where: str, episode: Episode) -> Scene:
+def scene_of(lab: Lab, filter: Any, where: str, grid: OccupancyGrid, episode: Episode) -> Scene:
     """PM and trust at the truth, for every scan of a sequence."""
-    grid = next(g for name, g, _ in lab.suite.episodes if name == where)
     found = quality.judge(filter.proposal, grid, episode.ranges, episode.poses)
     scored = lab.build("mcl", where, grid, episode)  # Its weights are those of Alg 1.
     return Scene(np.asarray(found.mass), np.asarray(trusts(scored, episode.poses, episode.ranges)))
@@ -110,6 +112,7 @@ def errors_by_t_cut(everything: Everything) -> Figure:
             ax.plot(list(paper.T_CUT), theirs, "ks--", markersize=4, linewidth=1, label="paper, Table I")
             ax.set(title=title, yscale="log", xlabel="$T_{cut}$", ylabel=label)
             _finish(ax)
+            log_ticks(ax.yaxis)
     handles, labels = grid[0][0].get_legend_handles_labels()
     legend(figure, handles, labels, 2)
     return figure

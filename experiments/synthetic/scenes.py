@@ -20,7 +20,8 @@ from dsom_jax.raycast import RaycastConfig, cast_rays, make_tables
 from dsom_jax.simulate.morphology import clear_of, components, grow
 from dsom_jax.simulate.obstacles import add_obstacles, remove_structure
 from dsom_jax.simulate.worlds import WorldConfig, make_world
-from dsom_jax.training.batches import PLAIN, random_poses
+from dsom_jax.training.batches import PLAIN
+from dsom_jax.training.buildings import random_poses
 from dsom_jax.types import Array, Key
 
 WORLD = WorldConfig()
