@@ -162,7 +162,7 @@ def figures(everything: Everything) -> dict[str, Figure]:
 
 def _rows(curves: dict[str, Any]) -> Figure:
     figure = Figure(figsize=(11, 2.7 * len(curves) + 0.5), layout="constrained")
-    figure.get_layout_engine().set(wspace=0.05)  # type: ignore[union-attr]  # it is the constrained one
+    figure.get_layout_engine().set(wspace=0.05)  # type: ignore[union-attr, call-arg]  # it is the constrained one
     grid = figure.subplots(len(curves), len(SHOWN), squeeze=False, sharey=True)
     for axes, curve in zip(grid, curves.values(), strict=True):
         for ax, (key, label) in zip(axes, SHOWN.items(), strict=True):
