@@ -50,10 +50,12 @@ def identical(a, b):
     jax.tree.map(np.testing.assert_array_equal, a, b)
 
 
-def test_adam_that_trusts_everyone_is_mcl_is_mixture_that_never_redraws(world, spot, episode):
-    mcl = follow(MCL(world, MCL_ONLY, injection=0.0), episode, 4)
-    adam = follow(AdamMCL(world, spot, MCL_ONLY, t_cut=0.0), episode, 4)
-    mixture = follow(MixtureMCL(world, spot, MCL_ONLY, p=1.0), episode, 4)
+@pytest.mark.parametrize("power", [1.0, 5.0])
+def test_adam_that_trusts_everyone_is_mcl_is_mixture_that_never_redraws(power, world, spot, episode):
+    config = replace(MCL_ONLY, weight_power=power)
+    mcl = follow(MCL(world, config, injection=0.0), episode, 4)
+    adam = follow(AdamMCL(world, spot, config, t_cut=0.0), episode, 4)
+    mixture = follow(MixtureMCL(world, spot, config, p=1.0), episode, 4)
     for (a, _), (b, _), (c, _) in zip(mcl, adam, mixture, strict=True):
         identical(a, b)
         identical(a, c)
@@ -96,6 +98,17 @@ def test_trust_decides_who_is_redrawn(world, spot, episode):
     sets = [step(f, key, state, at(episode, 1))[0].poses for key in jax.random.split(jax.random.key(0), 60)]
     kept = [1 - in_spot(spot, poses).reshape(4, -1).mean(1) for poses in sets]
     np.testing.assert_allclose(np.mean(kept, 0), [1.0, 0.5, 0.1, 0.0], atol=5 * 0.5 / np.sqrt(60 * 16))
+
+
+def test_weights_are_raised_to_a_power_and_trust_is_not(world, spot, episode):
+    """The first update is the same for all powers but for w_norm; the next one resamples by it."""
+    (first, _), (_, info) = follow(AdamMCL(world, spot, MCL_ONLY, t_cut=0.0), episode, 2)
+    (sharp, _), (_, sharper) = follow(AdamMCL(world, spot, replace(MCL_ONLY, weight_power=5.0), t_cut=0.0), episode, 2)
+    identical((first.poses, first.weights), (sharp.poses, sharp.weights))
+    powered = np.asarray(first.weights, np.float64) ** 5
+    np.testing.assert_allclose(sharp.normalised, powered / powered.sum(), rtol=1e-5)
+    np.testing.assert_allclose(first.normalised, first.weights / first.weights.sum(), rtol=1e-5)
+    assert float(sharper.lost) < float(info.lost)
 
 
 @pytest.mark.parametrize("rule", ["knn", "motion"])

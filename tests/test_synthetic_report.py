@@ -23,7 +23,7 @@ from dsom_jax.metrics import Runs, measure_errors, pool, summarize
 from dsom_jax.montecarlo import run, run_keys
 from dsom_jax.occupancy import from_cells
 from dsom_jax.raycast import RaycastConfig, cast_rays, make_tables
-from dsom_jax.run_table import join, run_rows
+from dsom_jax.run_table import RunTable, join, run_rows
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "experiments" / "synthetic"))
@@ -302,3 +302,19 @@ def test_a_damaged_result_is_named(tmp_path):
     (tmp_path / "made.a.json").write_text('{"made": ')
     with pytest.raises(UserError, match=r"made\.a\.json"):
         lab.read(tmp_path / "made.a.json")
+
+
+def test_spread_of_settings_leaves_out_sequences_in_which_one_never_converged():
+    """Means 1 and 3 over the sequences that both have; sequence 1 has runs of the first setting only."""
+    sides = [_errors({0: [1.0, 1.0], 1: [1.0]}), _errors({0: [3.0, 3.0]})]
+    estimate, low, high = verdicts.spread(sides)
+    assert (estimate, low, high) == (2.0, 2.0, 2.0)
+
+
+def _errors(by_sequence: dict[int, list[float]]) -> Any:
+    """Converged runs with these final errors, metres."""
+    rows = [(sequence, error) for sequence, errors in by_sequence.items() for error in errors]
+    sequence, error = (np.array(column) for column in zip(*rows, strict=True))
+    n = len(rows)
+    names = np.full(n, "a")
+    return RunTable(names, names, sequence, np.zeros(n, int), np.arange(n), np.zeros(n, int), error, error, error)

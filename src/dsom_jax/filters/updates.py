@@ -30,14 +30,17 @@ class FilterConfig:
         predecessor: how dual MCL finds the particle whose weight a redrawn one inherits: ``knn`` draws from the three
             nearest moved particles by inverse distance (the authors' way), ``motion`` by p(l' | a, l).
         resampling: scheme for the MCL part.
+        weight_power: w_norm is proportional to w to this power; 1 in the paper. Trust is w itself.
     """
 
     particles: int = 200
     predecessor: Predecessor = "knn"
     resampling: Resampling = "systematic"
+    weight_power: float = 1.0
 
     def __post_init__(self) -> None:
         checks.count(self, "particles")
+        checks.positive(self, "weight_power")
         checks.choice(self, "predecessor", get_args(Predecessor))
         checks.choice(self, "resampling", get_args(Resampling))
 
@@ -158,7 +161,9 @@ def _nearest(poses: Array, others: Array, count: int) -> tuple[Array, Array]:
     return jax.lax.bitcast_convert_type(best & ~low, jnp.float32), best & low
 
 
-def mix(state: ParticleState, high: Array, trusted: Draw, redrawn: Draw, spare: Array) -> tuple[ParticleState, Info]:
+def mix(
+    state: ParticleState, high: Array, trusted: Draw, redrawn: Draw, spare: Array, power: float = 1.0
+) -> tuple[ParticleState, Info]:
     """P_t of the two branches; if every weight has vanished, the poses ``spare`` (N, 3) take over (flagged in Info).
 
     They are trusted for one update, or none of them would ever be weighed.
@@ -168,7 +173,7 @@ def mix(state: ParticleState, high: Array, trusted: Draw, redrawn: Draw, spare: 
     dead = ~(weights.sum() > 0)
     poses = jnp.where(dead, spare, poses)
     weights = jnp.where(dead, 1.0, weights)
-    normalised = normalise(weights)
+    normalised = normalise(weights**power)
     return ParticleState(poses, weights, normalised, state.updates + 1), describe(
         poses, normalised, 1.0 - high.mean(), dead
     )
@@ -188,7 +193,7 @@ def mixture_update(
     k_high, k_low = jax.random.split(key)
     trusted = mcl_update(k_high, state, high, inputs, world, config)
     redrawn = dual_update(k_low, state, inputs, world, proposal, prepared, config)
-    return mix(state, high, trusted, redrawn, redrawn.poses)
+    return mix(state, high, trusted, redrawn, redrawn.poses, config.weight_power)
 
 
 @dataclass(frozen=True)
