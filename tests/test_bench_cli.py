@@ -84,7 +84,7 @@ def suite(monkeypatch):
             raise UserError(f"--suite {name}: no such suite")
         return made
 
-    def build(name, grid, lidar, *, particles, t_cut, episode, checkpoint, sources):
+    def build(name, grid, lidar, *, particles, t_cut, weight_power, episode, checkpoint, sources):
         return Oracle(episode.poses, DELAYS[name], particles)
 
     monkeypatch.setattr(bench, "load_suite", load)
@@ -99,7 +99,7 @@ def command(monkeypatch, *words: str) -> None:
 
 def test_known_filters_get_their_numbers(suite):
     data = bench.benchmark(suite, ("mcl", "adam_likelihood_grid", "robust_likelihood_grid"), runs=4, particles=5)
-    assert set(data) >= {"suite", "runs", "particles", "t_cut", "seed", "device", "methods"}
+    assert set(data) >= {"suite", "runs", "particles", "t_cut", "seed", "weight_power", "device", "methods"}
     assert (data["suite"], data["runs"], data["particles"], data["t_cut"], data["seed"]) == ("made-up", 4, 5, 0.6, 0)
     lost, late, soon = data["methods"].values()
     for phase in ("global", "kidnap"):
@@ -193,6 +193,8 @@ def test_default_methods_are_those_that_can_be_run(tmp_path):
         (("--particles", "-3"), "--particles"),
         (("--t-cut", "1.5"), "--t-cut"),
         (("--t-cut", "nan"), "--t-cut"),
+        (("--weight-power", "0"), "--weight-power"),
+        (("--weight-power", "nan"), "--weight-power"),
         (("--seed", "-1"), "--seed"),
         (("--methods", "mcl,magic"), "magic"),
         (("--methods", "adam_dsom"), "--checkpoint"),

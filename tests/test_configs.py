@@ -58,7 +58,9 @@ WRONG: dict[type, tuple[dict, dict]] = {
     }),
     OmniMotion: ({}, {"alpha1": (NAN,), "alpha5": (-0.1,), "min_xy": (-1.0,), "min_theta": (INF,)}),
     AdditiveMapFrame: ({}, {"sigma_xy": (-0.1,), "sigma_theta": (NAN,)}),
-    FilterConfig: ({}, {"particles": (0, -5, 1.5), "predecessor": ("nearest",), "resampling": ("none",)}),
+    FilterConfig: ({}, {
+        "particles": (0, -5, 1.5), "predecessor": ("nearest",), "resampling": ("none",), "weight_power": (0.0, NAN),
+    }),
     MCL: (FILTER, {"injection": (-0.1, 1.1, NAN)}),
     MixtureMCL: (SHARED, {"p": (-0.1, 1.1, NAN)}),
     AdamMCL: (SHARED, {"t_cut": (-0.1, 7, NAN)}),
@@ -66,7 +68,10 @@ WRONG: dict[type, tuple[dict, dict]] = {
         "particles": (0,), "kidnap": (0.0, 1.0, NAN), "low_min": (0.0, 0.6), "low_max": (1.0,), "flatten": (1.0, -0.1),
         "caution": (1.0,),
     }),
-    Settings: ({}, {"particles": (0,), "max_beams": (0,), "seed": (-1,), "t_cut": (1.1,), "sharpness": (0.0, NAN)}),
+    Settings: ({}, {
+        "particles": (0,), "max_beams": (0,), "seed": (-1,), "t_cut": (1.1,), "sharpness": (0.0, NAN),
+        "weight_power": (0.0, NAN),
+    }),
     LikelihoodGridConfig: ({}, {
         "resolution": (0.0, NAN), "headings": (0,), "angles_per_heading": (0,), "beams": (0,),
     }),

@@ -111,6 +111,15 @@ def test_weights_are_raised_to_a_power_and_trust_is_not(world, spot, episode):
     assert float(sharper.lost) < float(info.lost)
 
 
+def test_powers_of_tiny_weights_do_not_vanish(world, spot, episode, grid):
+    """Weights of 1e-12 to the power of eight are below what single precision can hold."""
+    f = AdamMCL(world, spot, replace(MCL_ONLY, weight_power=8.0))
+    before = tiny_trust(grid, 64)  # all are redrawn and inherit one of these
+    after, _ = step(f, jax.random.key(0), before, at(episode, 1))
+    inherited = np.asarray(after.weights, np.float64) ** 8
+    np.testing.assert_allclose(after.normalised, inherited / inherited.sum(), rtol=1e-4)
+
+
 @pytest.mark.parametrize("rule", ["knn", "motion"])
 def test_weights_are_inherited_from_a_predecessor(rule, world, episode, grid):
     n = 300

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from tables import bounds, markdown, number, percent
 
 from dsom_jax import bench, plotting
-from dsom_jax.filters.methods import METHODS
+from dsom_jax.filters.methods import METHODS, WEIGHT_POWER
 from dsom_jax.metrics import STEP_BINS
 from dsom_jax.run_table import RunTable, join
 
@@ -30,12 +30,13 @@ ABLATED = ("mcl", "mixture_mcl_star", "mixture_mcl_dsom", "adam_dsom", "adam_lik
 
 @dataclass(frozen=True)
 class Config:
-    """Attributes: methods; runs of each on each sequence; particles; T_cut of Alg 1."""
+    """Attributes: methods; runs of each on each sequence; particles; T_cut of Alg 1; power of Eq 15's weights."""
 
     methods: tuple[str, ...] = METHODS
     runs: int = 100
     particles: int = 200
     t_cut: float = 0.6
+    weight_power: float = WEIGHT_POWER
 
 
 def jobs(config: Config) -> dict[str, Any]:
@@ -45,8 +46,8 @@ def jobs(config: Config) -> dict[str, Any]:
 
 def compare(name: str, config: Config, lab: Lab) -> dict[str, Any]:
     """One method on all sequences: its entry of ``bench.json``, every run, and E_pos over time."""
-    settings = bench.Settings(config.runs, config.particles, config.t_cut, lab.seed)
-    build = partial(lab.build, particles=config.particles, t_cut=config.t_cut)
+    settings = bench.Settings(config.runs, config.particles, config.t_cut, lab.seed, config.weight_power)
+    build = partial(lab.build, particles=config.particles, t_cut=config.t_cut, weight_power=config.weight_power)
     record = bench.run_method(name, lab.suite, lab.keys(config.runs), build)
     entry = bench.summary(lab.suite, {name: record}, settings)["methods"][name]
     return {"summary": entry, "runs": rows(record.table), "evolution": [band(trace) for trace in record.traces],

@@ -26,7 +26,7 @@ from dsom_jax.compiling import run_options
 from dsom_jax.data.suite import Suite, load_suite
 from dsom_jax.episode import Episode
 from dsom_jax.errors import UserError
-from dsom_jax.filters.methods import build_filter, network_of
+from dsom_jax.filters.methods import WEIGHT_POWER, build_filter, network_of
 from dsom_jax.montecarlo import run_keys
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.run_folder import commit
@@ -85,12 +85,21 @@ class Lab:
         return [run_keys(self.seed, number, runs) for number in range(len(self.suite.episodes))]
 
     def build(
-        self, name: str, where: str, grid: OccupancyGrid, episode: Episode, particles: int = 200, t_cut: float = 0.6
+        self,
+        name: str,
+        where: str,
+        grid: OccupancyGrid,
+        episode: Episode,
+        particles: int = 200,
+        t_cut: float = 0.6,
+        weight_power: float = WEIGHT_POWER,
     ) -> Filter:
         """Filter of a method of :data:`dsom_jax.filters.methods.METHODS` on the map called ``where``."""
         network = self.networks.get(network_of(name) or "")
         made = self.sources.setdefault(where, {})
-        own: dict[str, Any] = {"particles": particles, "t_cut": t_cut, "episode": episode}
+        own: dict[str, Any] = {
+            "particles": particles, "t_cut": t_cut, "weight_power": weight_power, "episode": episode,
+        }  # fmt: skip
         return jax.block_until_ready(
             build_filter(name, grid, self.suite.lidar, **own, checkpoint=network, sources=made)
         )

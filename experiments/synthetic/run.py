@@ -21,6 +21,7 @@ import multimodal
 import odometry
 import one_scan
 import particles
+import printed
 import retention
 import write_report
 from lab import Job, Lab, Piece, measured, read, result_path, scaled, write
@@ -31,7 +32,7 @@ from dsom_jax.errors import UserError, run_cli
 
 HERE = Path(__file__).resolve().parent
 PIECES: tuple[Piece, ...] = tuple(
-    module.PIECE for module in (multimodal, comparison, retention, particles, odometry, one_scan, cost)
+    module.PIECE for module in (multimodal, comparison, printed, retention, particles, odometry, one_scan, cost)
 )
 
 

@@ -207,7 +207,7 @@ def spread(sides: list[RunTable], resamples: int = 500, seed: int = 0) -> tuple[
 
     def redrawn(side: RunTable, picked: np.ndarray) -> float:
         groups = [side.e_pos_m[side.sequence == n] for n in picked]
-        values = np.concatenate([rng.choice(group, len(group)) for group in groups if len(group)] or [[]])
+        values = np.concatenate([rng.choice(group, len(group)) for group in groups if len(group)] or [np.empty(0)])
         return float(values.mean()) if len(values) else float("nan")
 
     names = np.unique(np.concatenate([side.sequence for side in sides]))

@@ -17,6 +17,7 @@ from dsom_jax.report import write_text
 TITLES = {
     "multimodal": "Multimodality of PM (Fig 3)",
     "comparison": "Comparison and ablation (Fig 5, 6, 7)",
+    "printed": "Weights as printed",
     "retention": "T_cut (Table I) and retention",
     "particles": "Number of particles (Table II)",
     "odometry": "Noise of the odometry",

@@ -16,7 +16,7 @@ from dsom_jax.cli import Advance, parse, progress_bar
 from dsom_jax.data.suite import Suite, load_suite
 from dsom_jax.episode import Episode
 from dsom_jax.errors import UserError, run_cli
-from dsom_jax.filters.methods import METHODS, STANDARD, build_filter, network_of
+from dsom_jax.filters.methods import METHODS, STANDARD, WEIGHT_POWER, build_filter, network_of
 from dsom_jax.montecarlo import Result, run, run_keys, signature
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.run_table import RunTable, join, run_rows
@@ -46,6 +46,8 @@ class Args:
     """T_cut of Alg 1: particles with a higher trust always keep their history."""
     seed: int = 0
     """Seed of all randomness; method, sequence and run number do the rest."""
+    weight_power: float = WEIGHT_POWER
+    """Power of the weights of Eq 15 by which mcl, mixture_* and adam_* draw and average particles; 1 is the paper's."""
     out: Path | None = None
     """Folder for bench.json, bench.md and figures."""
     checkpoint: Path | None = None
@@ -66,6 +68,7 @@ class Settings:
     particles: int = 200
     t_cut: float = 0.6
     seed: int = 0
+    weight_power: float = WEIGHT_POWER
 
     def __post_init__(self) -> None:
         for name, value in (("--runs", self.runs), ("--particles", self.particles)):
@@ -75,6 +78,8 @@ class Settings:
             raise UserError(f"--t-cut {self.t_cut}: give a number between 0 and 1 (the paper uses 0.6)")
         if not 0 <= self.seed < 2**32:
             raise UserError(f"--seed {self.seed}: give 0 or more, and less than 2^32")
+        if not 0 < self.weight_power <= 1000:
+            raise UserError(f"--weight-power {self.weight_power:g}: give more than 0, at most 1000 (1: as printed)")
 
 
 class Record(NamedTuple):
@@ -110,12 +115,13 @@ def benchmark(
     seed: int = 0,
     progress: Advance | None = None,
     checkpoint: Any = None,
+    weight_power: float = WEIGHT_POWER,
 ) -> dict[str, Any]:
     """The contents of ``bench.json``; ``progress(method, sequence)`` is called before each drive.
 
     ``checkpoint`` is a network, or networks by kind, as for :func:`collect`.
     """
-    settings = Settings(runs, particles, t_cut, seed)
+    settings = Settings(runs, particles, t_cut, seed, weight_power)
     return summary(suite, collect(suite, methods, settings, progress, checkpoint), settings)
 
 
@@ -132,9 +138,11 @@ def collect(
     sources: dict[str, dict[str, Proposal]] = {where: {} for where, _, _ in suite.episodes}
 
     def build(name: str, where: str, grid: OccupancyGrid, episode: Episode) -> Filter:
-        own: dict[str, Any] = {"particles": settings.particles, "t_cut": settings.t_cut, "episode": episode}
+        own: dict[str, Any] = {name: getattr(settings, name) for name in ("particles", "t_cut", "weight_power")}
         network = trained.get(network_of(name) or "")
-        filter = build_filter(name, grid, suite.lidar, **own, checkpoint=network, sources=sources[where])
+        filter = build_filter(
+            name, grid, suite.lidar, **own, episode=episode, checkpoint=network, sources=sources[where]
+        )
         return jax.block_until_ready(filter)
 
     keys = [run_keys(settings.seed, number, settings.runs) for number in range(len(suite.episodes))]
@@ -270,7 +278,7 @@ def main() -> None:
     args = parse(Args, "python -m dsom_jax.bench")
     if args.per_run and not args.out:
         raise UserError("--per-run: give --out, the folder for runs.npz")
-    settings = Settings(args.runs, args.particles, args.t_cut, args.seed)
+    settings = Settings(args.runs, args.particles, args.t_cut, args.seed, args.weight_power)
     asked = {"dsom": args.checkpoint, "pf_net": args.pf_net, "pfrnn": args.pfrnn}
     folders = find_networks(asked)
     methods = chosen_methods(args.methods, folders)

@@ -61,6 +61,10 @@ def network_of(method: str) -> str | None:
     return "dsom" if COMBINATIONS[method][1].endswith(("dsom", "hybrid")) else None
 
 
+WEIGHT_POWER = 8.0
+"""Default of :attr:`Settings.weight_power`."""
+
+
 @dataclass(frozen=True)
 class Settings:
     """What all filters of a comparison share; ``range_max`` of the sensor models follows the lidar.
@@ -71,6 +75,8 @@ class Settings:
         max_beams: beams used for weighing.
         seed: of what is random while a filter is built (the samples of Mixture MCL).
         motion, score, raycast: drive, Eq 15 and expected ranges of the paper's filters.
+        weight_power: particles are drawn and averaged by Eq 15 to this power, as if so many such scans had been seen;
+            1 as printed, where a particle elsewhere weighs half as much as one at the truth (``experiments/bench``).
         grid: the likelihood grid.
         sharpness: exponent of DSOM's PM (``experiments/dsom``).
         hybrid: weights of likelihood grid and network.
@@ -90,6 +96,7 @@ class Settings:
     score: ScoreModel = ScoreModel()
     raycast: RaycastConfig = RaycastConfig("table")
     grid: LikelihoodGridConfig = LikelihoodGridConfig()
+    weight_power: float = WEIGHT_POWER
     sharpness: float = 2.0
     hybrid: HybridConfig = HybridConfig()
     robust: RobustConfig = RobustConfig(model=BeamModel(0.65, 0.05, 0.05, 0.25, sigma_hit=0.1, temper=0.2))
@@ -105,7 +112,7 @@ class Settings:
         checks.count(self, "seed", 0)
         checks.share(self, "t_cut")
         checks.span(self, "memory_share")
-        checks.positive(self, "sharpness memory_temper")
+        checks.positive(self, "weight_power sharpness memory_temper")
 
 
 _SCANNED = 1.0
@@ -138,6 +145,7 @@ def build_filter(
     *,
     particles: int,
     t_cut: float,
+    weight_power: float = WEIGHT_POWER,
     episode: Episode | None = None,
     checkpoint: Any = None,
     sources: dict[str, Proposal] | None = None,
@@ -151,7 +159,7 @@ def build_filter(
     if name in LEARNED:
         return LEARNED[name](checkpoint, grid, lidar, particles)
     algorithm, proposal = COMBINATIONS[name]
-    settings = Settings(particles=particles, t_cut=t_cut)
+    settings = Settings(particles=particles, t_cut=t_cut, weight_power=weight_power)
     sources, base = {} if sources is None else sources, proposal.removesuffix(_STAR)
     for needed in (*PARTS.get(base, ()), base):
         if needed not in sources:
@@ -205,7 +213,7 @@ def make_filter(
     score = replace(settings.score, range_max=lidar.range_max)
     tables = make_tables(grid, settings.raycast, lidar.range_max)
     world = World(tables, space, used, step, settings.motion, score)
-    config = FilterConfig(settings.particles)
+    config = FilterConfig(settings.particles, weight_power=settings.weight_power)
     if algorithm == "mcl":
         return MCL(world, config)
     if algorithm == "mixture_mcl":

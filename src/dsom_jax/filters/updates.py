@@ -161,6 +161,11 @@ def _nearest(poses: Array, others: Array, count: int) -> tuple[Array, Array]:
     return jax.lax.bitcast_convert_type(best & ~low, jnp.float32), best & low
 
 
+def relative_weights(weights: Array) -> Array:
+    """Weights (N,), not all zero, in units of the largest: their powers do not vanish in single precision."""
+    return weights / weights.max()
+
+
 def mix(
     state: ParticleState, high: Array, trusted: Draw, redrawn: Draw, spare: Array, power: float = 1.0
 ) -> tuple[ParticleState, Info]:
@@ -173,7 +178,7 @@ def mix(
     dead = ~(weights.sum() > 0)
     poses = jnp.where(dead, spare, poses)
     weights = jnp.where(dead, 1.0, weights)
-    normalised = normalise(weights**power)
+    normalised = normalise(weights if power == 1 else relative_weights(weights) ** power)
     return ParticleState(poses, weights, normalised, state.updates + 1), describe(
         poses, normalised, 1.0 - high.mean(), dead
     )
