@@ -70,7 +70,7 @@ WRONG: dict[type, tuple[dict, dict]] = {
     }),
     Settings: ({}, {
         "particles": (0,), "max_beams": (0,), "seed": (-1,), "t_cut": (1.1,), "sharpness": (0.0, NAN),
-        "weight_power": (0.0, NAN),
+        "weight_power": (0.0, NAN), "robust_sharpness": (0.0, NAN),
     }),
     LikelihoodGridConfig: ({}, {
         "resolution": (0.0, NAN), "headings": (0,), "angles_per_heading": (0,), "beams": (0,),

@@ -21,7 +21,7 @@ from dsom_jax.filters.updates import FilterConfig, World
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.motion import OdometryMotion
 from dsom_jax.occupancy import OccupancyGrid
-from dsom_jax.proposals.dsom import dsom
+from dsom_jax.proposals.dsom import DSOMProposal, dsom
 from dsom_jax.proposals.dual_features import DualFeaturesConfig, dual_features, with_episode
 from dsom_jax.proposals.hybrid import Hybrid, HybridConfig
 from dsom_jax.proposals.likelihood_grid import LikelihoodGrid, LikelihoodGridConfig, likelihood_grid
@@ -76,11 +76,12 @@ class Settings:
         seed: of what is random while a filter is built (the samples of Mixture MCL).
         motion, score, raycast: drive, Eq 15 and expected ranges of the paper's filters.
         weight_power: particles are drawn and averaged by Eq 15 to this power, as if so many such scans had been seen;
-            1 as printed, where a particle elsewhere weighs half as much as one at the truth (``experiments/bench``).
+            1 as printed, where a particle elsewhere weighs half as much as one at the truth (experiments/REPORT.md).
         grid: the likelihood grid.
-        sharpness: exponent of DSOM's PM (``experiments/dsom``).
+        sharpness: exponent of DSOM's PM in the paper's filters (``experiments/dsom``).
         hybrid: weights of likelihood grid and network.
         robust, robust_motion, robust_raycast: AdaM robust; its ``particles`` are those above.
+        robust_sharpness: exponent of DSOM's PM there, where draws are corrected for what they were drawn from.
         memory: AdaM robust with the likelihood grid as proposal remembers earlier scans on the grid.
         memory_share: least and greatest weight of what that memory says, beside the particles' own past.
         memory_temper: factor on a scan's log-likelihood in that memory, in place of the grid's own: where the map is
@@ -97,11 +98,12 @@ class Settings:
     raycast: RaycastConfig = RaycastConfig("table")
     grid: LikelihoodGridConfig = LikelihoodGridConfig()
     weight_power: float = WEIGHT_POWER
-    sharpness: float = 2.0
+    sharpness: float = 3.0
     hybrid: HybridConfig = HybridConfig()
     robust: RobustConfig = RobustConfig(model=BeamModel(0.65, 0.05, 0.05, 0.25, sigma_hit=0.1, temper=0.2))
     robust_motion: Motion = OdometryMotion(0.01, 0.01, 0.01, 0.01, 0.02, 0.015, slip=0.1, tail=0.4, tail_scale=4.0)
     robust_raycast: RaycastConfig = RaycastConfig("table")
+    robust_sharpness: float = 1.0
     memory: bool = False
     memory_share: tuple[float, float] = (0.01, 0.5)
     memory_temper: float = 0.05
@@ -112,7 +114,7 @@ class Settings:
         checks.count(self, "seed", 0)
         checks.share(self, "t_cut")
         checks.span(self, "memory_share")
-        checks.positive(self, "weight_power sharpness memory_temper")
+        checks.positive(self, "weight_power sharpness robust_sharpness memory_temper")
 
 
 _SCANNED = 1.0
@@ -198,7 +200,7 @@ def make_proposal(
 def make_filter(
     algorithm: Algorithm, proposal: Proposal, grid: OccupancyGrid, lidar: LidarConfig, settings: Settings
 ) -> Filter:
-    """Filter ``algorithm`` drawing from ``proposal``."""
+    """Filter ``algorithm`` drawing from ``proposal``; that of a network is sharpened as ``settings`` say for it."""
     step = -(-lidar.beams // settings.max_beams)
     used, space = lidar.every(step), free_space(grid)
     if algorithm == "adam_robust":
@@ -206,6 +208,8 @@ def make_filter(
         robust = replace(settings.robust, particles=settings.particles, model=model)
         tables = make_tables(grid, settings.robust_raycast, lidar.range_max)
         parts = (used, step, settings.robust_motion, robust)
+        if isinstance(proposal, DSOMProposal):
+            proposal = replace(proposal, sharpness=settings.robust_sharpness)
         if settings.memory and isinstance(proposal, LikelihoodGrid):
             memory = MarkovGrid(proposal.tempered(settings.memory_temper), settings.markov)
             return AdamMemory(tables, space, memory, *parts, settings.memory_share)
