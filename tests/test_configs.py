@@ -60,6 +60,7 @@ WRONG: dict[type, tuple[dict, dict]] = {
     AdditiveMapFrame: ({}, {"sigma_xy": (-0.1,), "sigma_theta": (NAN,)}),
     FilterConfig: ({}, {
         "particles": (0, -5, 1.5), "predecessor": ("nearest",), "resampling": ("none",), "weight_power": (0.0, NAN),
+        "estimate_power": (0.0, NAN),
     }),
     MCL: (FILTER, {"injection": (-0.1, 1.1, NAN)}),
     MixtureMCL: (SHARED, {"p": (-0.1, 1.1, NAN)}),

@@ -52,7 +52,7 @@ def identical(a, b):
 
 @pytest.mark.parametrize("power", [1.0, 5.0])
 def test_adam_that_trusts_everyone_is_mcl_is_mixture_that_never_redraws(power, world, spot, episode):
-    config = replace(MCL_ONLY, weight_power=power)
+    config = replace(MCL_ONLY, weight_power=power, estimate_power=3.0)
     mcl = follow(MCL(world, config, injection=0.0), episode, 4)
     adam = follow(AdamMCL(world, spot, config, t_cut=0.0), episode, 4)
     mixture = follow(MixtureMCL(world, spot, config, p=1.0), episode, 4)
@@ -103,12 +103,24 @@ def test_trust_decides_who_is_redrawn(world, spot, episode):
 def test_weights_are_raised_to_a_power_and_trust_is_not(world, spot, episode):
     """The first update is the same for all powers but for w_norm; the next one resamples by it."""
     (first, _), (_, info) = follow(AdamMCL(world, spot, MCL_ONLY, t_cut=0.0), episode, 2)
-    (sharp, _), (_, sharper) = follow(AdamMCL(world, spot, replace(MCL_ONLY, weight_power=5.0), t_cut=0.0), episode, 2)
+    config = replace(MCL_ONLY, weight_power=5.0)
+    (sharp, _), (_, sharper) = follow(AdamMCL(world, spot, config, t_cut=0.0), episode, 2)
     identical((first.poses, first.weights), (sharp.poses, sharp.weights))
     powered = np.asarray(first.weights, np.float64) ** 5
     np.testing.assert_allclose(sharp.normalised, powered / powered.sum(), rtol=1e-5)
     np.testing.assert_allclose(first.normalised, first.weights / first.weights.sum(), rtol=1e-5)
     assert float(sharper.lost) < float(info.lost)
+
+
+def test_estimates_have_a_power_of_their_own(world, spot, episode):
+    """It changes no particle; the mean is that of the weights to the power."""
+    f = AdamMCL(world, spot, MCL_ONLY)
+    plain, powered = (follow(replace(f, config=replace(MCL_ONLY, estimate_power=p)), episode, 3) for p in (1.0, 6.0))
+    identical([state for state, _ in plain], [state for state, _ in powered])
+    state, info = powered[-1]
+    share = np.asarray(state.weights, np.float64) ** 6
+    expected = (np.asarray(state.poses)[:, :2] * share[:, None]).sum(0) / share.sum()
+    np.testing.assert_allclose(info.mean[:2], expected, rtol=1e-4)
 
 
 def test_powers_of_tiny_weights_do_not_vanish(world, spot, episode, grid):

@@ -12,6 +12,7 @@ import pytest
 
 import tiny_world
 from dsom_jax import pose_grid as pg
+from dsom_jax.filters.methods import Settings, make_filter, make_proposal
 from dsom_jax.geometry import compose
 from dsom_jax.nn import DSOMConfig, create, evaluation_view
 from dsom_jax.occupancy import is_free, resample
@@ -120,3 +121,13 @@ def test_a_mounted_lidar_still_gives_poses_of_the_base(parts):
 def test_weights_that_mean_nothing_are_refused(change):
     with pytest.raises(ValueError, match="HybridConfig"):
         HybridConfig(**change)
+
+
+def test_a_network_is_sharpened_for_the_papers_filters_and_not_for_robust_ones(scan):
+    """PM of the first is the exponent of PM of the second; the proposal itself stays what it was."""
+    grid, settings = tiny_world.grid(), Settings(sharpness=2.5, robust_sharpness=1.0, grid=GRID)
+    proposal = make_proposal("dsom", grid, LIDAR, settings, evaluation_view(create(NETWORK, seed=3)))
+    adam, robust = (make_filter(name, proposal, grid, LIDAR, settings) for name in ("adam", "adam_robust"))
+    sharp, plain = (np.asarray(prepare(f.proposal, scan).mass, np.float64) for f in (adam, robust))
+    np.testing.assert_allclose(sharp / sharp.sum(), plain**2.5 / (plain**2.5).sum(), rtol=1e-3, atol=1e-9)
+    assert proposal.sharpness == 2.5

@@ -47,7 +47,7 @@ class Args:
     seed: int = 0
     """Seed of all randomness; method, sequence and run number do the rest."""
     weight_power: float = WEIGHT_POWER
-    """Power of the weights of Eq 15 by which mcl, mixture_* and adam_* draw and average particles; 1 is the paper's."""
+    """Power of Eq 15 by which particles are drawn and averaged (:class:`filters.methods.Settings`); 1 as printed."""
     out: Path | None = None
     """Folder for bench.json, bench.md and figures."""
     checkpoint: Path | None = None

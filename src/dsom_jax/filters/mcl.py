@@ -48,7 +48,7 @@ class MCL:
         moved = mcl_update(k_high, state, everyone, inputs, self.world, self.config)
         fresh, _ = self.world.space.sample(k_fresh, None, self.config.particles)
         moved = self._inject(moved, fresh, inputs)
-        return mix(state, everyone, moved, moved, fresh, self.config.weight_power)
+        return mix(state, everyone, moved, moved, fresh, self.config)
 
     def _inject(self, draw: Draw, fresh: Array, inputs: Inputs) -> Draw:
         """Random particles in place of evenly spaced ones (neighbours in the set share an ancestor)."""

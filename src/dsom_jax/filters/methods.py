@@ -77,6 +77,8 @@ class Settings:
         motion, score, raycast: drive, Eq 15 and expected ranges of the paper's filters.
         weight_power: particles are drawn and averaged by Eq 15 to this power, as if so many such scans had been seen;
             1 as printed, where a particle elsewhere weighs half as much as one at the truth (experiments/REPORT.md).
+            Alg 1 with an exact likelihood as its proposal draws as printed: PM then is as good as sure, and what
+            gathers sooner than PM arrives stays at a wrong place that looks alike.
         grid: the likelihood grid.
         sharpness: exponent of DSOM's PM in the paper's filters (``experiments/dsom``).
         hybrid: weights of likelihood grid and network.
@@ -217,7 +219,9 @@ def make_filter(
     score = replace(settings.score, range_max=lidar.range_max)
     tables = make_tables(grid, settings.raycast, lidar.range_max)
     world = World(tables, space, used, step, settings.motion, score)
-    config = FilterConfig(settings.particles, weight_power=settings.weight_power)
+    power = settings.weight_power
+    drawn = 1.0 if algorithm == "adam" and isinstance(proposal, LikelihoodGrid | Hybrid) else power
+    config = FilterConfig(settings.particles, weight_power=drawn, estimate_power=power)
     if algorithm == "mcl":
         return MCL(world, config)
     if algorithm == "mixture_mcl":

@@ -30,17 +30,19 @@ class FilterConfig:
         predecessor: how dual MCL finds the particle whose weight a redrawn one inherits: ``knn`` draws from the three
             nearest moved particles by inverse distance (the authors' way), ``motion`` by p(l' | a, l).
         resampling: scheme for the MCL part.
-        weight_power: w_norm is proportional to w to this power; 1 in the paper. Trust is w itself.
+        weight_power: w_norm, by which particles are drawn, is proportional to w to this power; trust is w itself.
+        estimate_power: the same for the estimates. Both are 1 in the paper.
     """
 
     particles: int = 200
     predecessor: Predecessor = "knn"
     resampling: Resampling = "systematic"
     weight_power: float = 1.0
+    estimate_power: float = 1.0
 
     def __post_init__(self) -> None:
         checks.count(self, "particles")
-        checks.positive(self, "weight_power")
+        checks.positive(self, "weight_power estimate_power")
         checks.choice(self, "predecessor", get_args(Predecessor))
         checks.choice(self, "resampling", get_args(Resampling))
 
@@ -161,13 +163,13 @@ def _nearest(poses: Array, others: Array, count: int) -> tuple[Array, Array]:
     return jax.lax.bitcast_convert_type(best & ~low, jnp.float32), best & low
 
 
-def relative_weights(weights: Array) -> Array:
-    """Weights (N,), not all zero, in units of the largest: their powers do not vanish in single precision."""
-    return weights / weights.max()
+def powered(weights: Array, power: float) -> Array:
+    """Weights (N,) to a power, normalised; taken in units of the largest, as powers of small numbers vanish."""
+    return normalise(weights if power == 1 else (weights / weights.max()) ** power)
 
 
 def mix(
-    state: ParticleState, high: Array, trusted: Draw, redrawn: Draw, spare: Array, power: float = 1.0
+    state: ParticleState, high: Array, trusted: Draw, redrawn: Draw, spare: Array, config: FilterConfig
 ) -> tuple[ParticleState, Info]:
     """P_t of the two branches; if every weight has vanished, the poses ``spare`` (N, 3) take over (flagged in Info).
 
@@ -178,10 +180,8 @@ def mix(
     dead = ~(weights.sum() > 0)
     poses = jnp.where(dead, spare, poses)
     weights = jnp.where(dead, 1.0, weights)
-    normalised = normalise(weights if power == 1 else relative_weights(weights) ** power)
-    return ParticleState(poses, weights, normalised, state.updates + 1), describe(
-        poses, normalised, 1.0 - high.mean(), dead
-    )
+    info = describe(poses, powered(weights, config.estimate_power), 1.0 - high.mean(), dead)
+    return ParticleState(poses, weights, powered(weights, config.weight_power), state.updates + 1), info
 
 
 def mixture_update(
@@ -198,7 +198,7 @@ def mixture_update(
     k_high, k_low = jax.random.split(key)
     trusted = mcl_update(k_high, state, high, inputs, world, config)
     redrawn = dual_update(k_low, state, inputs, world, proposal, prepared, config)
-    return mix(state, high, trusted, redrawn, redrawn.poses, config.weight_power)
+    return mix(state, high, trusted, redrawn, redrawn.poses, config)
 
 
 @dataclass(frozen=True)
