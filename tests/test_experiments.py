@@ -6,6 +6,7 @@ import ast
 import importlib.util
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -24,14 +25,21 @@ def wants_torch(path: Path) -> bool:
     return any(name.split(".")[0] == "torch" for name in names)
 
 
+def of_a_script(module: ModuleType) -> bool:
+    """Whether a module lies in ``experiments``, whose folders have scripts of the same name."""
+    return Path(getattr(module, "__file__", None) or "/").is_relative_to(FOLDER)
+
+
 @pytest.fixture
 def only_here(monkeypatch):
     """Puts the search path and the modules back: scripts import their neighbours by short names such as ``timing``."""
-    before = dict(sys.modules)
+    before = {name: module for name, module in sys.modules.items() if of_a_script(module)}
+    for name in before:
+        del sys.modules[name]
     yield monkeypatch
-    for name in set(sys.modules) - set(before):
-        if Path(getattr(sys.modules[name], "__file__", None) or "/").is_relative_to(FOLDER):
-            del sys.modules[name]
+    for name in [name for name, module in sys.modules.items() if of_a_script(module)]:
+        del sys.modules[name]
+    sys.modules.update(before)
 
 
 @pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: f"{path.parent.name}/{path.name}")
