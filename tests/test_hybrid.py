@@ -131,3 +131,14 @@ def test_a_network_is_sharpened_for_the_papers_filters_and_not_for_robust_ones(s
     sharp, plain = (np.asarray(prepare(f.proposal, scan).mass, np.float64) for f in (adam, robust))
     np.testing.assert_allclose(sharp / sharp.sum(), plain**2.5 / (plain**2.5).sum(), rtol=1e-3, atol=1e-9)
     assert proposal.sharpness == 2.5
+
+
+@pytest.mark.parametrize("exact", [True, False])
+def test_alg_1_draws_as_printed_from_an_exact_likelihood_only(parts, exact):
+    """All else draws by Eq 15 to the power, and every estimate is one of weights to the power."""
+    settings = Settings(weight_power=6.0, grid=GRID)
+    for source in (parts[0], Hybrid(*parts, HybridConfig())) if exact else (parts[1],):
+        for name in ("adam", "mixture_mcl", "mcl"):
+            config = make_filter(name, source, tiny_world.grid(), LIDAR, settings).config
+            drawn = 1.0 if exact and name == "adam" else 6.0
+            assert (config.weight_power, config.estimate_power) == (drawn, 6.0)

@@ -234,7 +234,10 @@ def everything() -> dict[str, Any]:
         "cost": {"update": {"times": {"mcl": {"prepare": None, "step": seconds, "compiling_s": 1.0}}},
                  "map_size": {"rows": rows}},
     }  # fmt: skip
-    return {piece: {job: {"made": made({})} | entry for job, entry in jobs.items()} for piece, jobs in found.items()}
+    printed = {"printed": {"mcl": {"made": made({"weight_power": 1.0})} | entry}}
+    return printed | {
+        piece: {job: {"made": made({})} | entry for job, entry in jobs.items()} for piece, jobs in found.items()
+    }
 
 
 def test_sections_show_the_figures_that_are_drawn(everything):
