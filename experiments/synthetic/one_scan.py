@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -17,6 +19,7 @@ from tables import markdown, percent
 
 from dsom_jax import metrics
 from dsom_jax.filters.methods import DRAWN, Settings, make_proposal
+from dsom_jax.nn import DSOM
 from dsom_jax.plotting.common import legend
 from dsom_jax.statistics import clustered_bootstrap
 from dsom_jax.training import quality
@@ -98,13 +101,18 @@ class Bed:
         if condition not in self.judged:
             root = jax.random.fold_in(jax.random.key(lab.seed), _UNSEEN)
             keys = jax.random.split(root, self.config.worlds)
-            worlds = [self.world(n, key, condition, lab) for n, key in enumerate(keys)]
+            network = lab.networks["dsom"]
+            # One scan after the other keeps one core busy; buildings share nothing but what is compiled.
+            with ThreadPoolExecutor(os.cpu_count()) as pool:
+                worlds = list(pool.map(lambda n: self.world(n, keys[n], condition, network), range(len(keys))))
             parts = {name: [found[name] for _, found in worlds] for name in PROPOSALS}
             self.judged[condition] = {name: told(part) for name, part in parts.items()}
             self.judged[condition]["contradicting"] = beams_of([scans for scans, _ in worlds])
         return self.judged[condition]
 
-    def world(self, number: int, key: Key, condition: Condition, lab: Lab) -> tuple[Scans, dict[str, quality.Quality]]:
+    def world(
+        self, number: int, key: Key, condition: Condition, network: DSOM
+    ) -> tuple[Scans, dict[str, quality.Quality]]:
         """Scans in one building and what the proposals make of them."""
         k_place, k_scans = jax.random.split(key)
         place = number, condition.shown
@@ -112,13 +120,13 @@ class Bed:
             self.places[place] = map_and_building(k_place, condition)
         shown, world = self.places[place]
         scans = take(k_scans, shown, world, condition, self.config.scans)
-        made = self.proposals((*place, condition.lidar, condition.drawn), condition, lab)
+        made = self.proposals((*place, condition.lidar, condition.drawn), condition, network)
         return scans, {
             name: jax.tree.map(np.asarray, quality.judge(made[name], shown, scans.ranges, scans.poses))
             for name in PROPOSALS
         }
 
-    def proposals(self, place: Any, condition: Condition, lab: Lab) -> dict[str, Any]:
+    def proposals(self, place: Any, condition: Condition, network: DSOM) -> dict[str, Any]:
         """Proposals of one map and lidar; PM of DSOM is not sharpened, as it is the network that is judged."""
         if place in self.made:
             return self.made[place]
@@ -126,7 +134,7 @@ class Bed:
         made: dict[str, Any] = {}
         for name in PROPOSALS:
             grid = self.places[place[:2]][0]
-            made[name] = make_proposal(name, grid, condition.lidar, settings, lab.networks["dsom"], made)
+            made[name] = make_proposal(name, grid, condition.lidar, settings, network, made)
         # Only what most curves use is worth its memory.
         if (condition.shown, condition.lidar) == (Condition().shown, Condition().lidar):
             self.made[place] = made

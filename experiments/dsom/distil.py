@@ -1,0 +1,120 @@
+"""The paper's scan encoder learns from the polar one: ``python experiments/dsom/distil.py --teacher checkpoints/dsom``.
+
+From one-hot places alone the paper's network needs days of processor time on two cores. Here its coarse SIM follows
+that of a trained network, cell by cell and heading by heading, besides the truth; the map encoder and what fits of the
+decoder begin with the teacher's weights. What comes out begins the training with Eq 5, by ``train --init``. All other
+options, and what the folder holds, are those of ``python -m dsom_jax.train``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import nnx
+
+from dsom_jax import checkpoint
+from dsom_jax.cli import parse
+from dsom_jax.compiling import training_options
+from dsom_jax.errors import run_cli
+from dsom_jax.nn import DSOM, create
+from dsom_jax.nn.dsom import MapFeatures
+from dsom_jax.train import Arguments, Material, open_run, parts
+from dsom_jax.trainer import train
+from dsom_jax.training.batches import Batch
+from dsom_jax.training.descent import descend, follow_average
+from dsom_jax.training.loop import TrainConfig, TrainState, split_model
+from dsom_jax.training.loss import PLACES, similarity_loss
+from dsom_jax.training.memory import keep_freed_memory
+from dsom_jax.training.target import make_target
+from dsom_jax.types import Array
+
+LIKENESS = 10.0
+"""Weight of the correlation with the teacher's SIM beside the cross-entropies."""
+
+
+@dataclass(frozen=True)
+class Args(Arguments):
+    """Train the encoders of a network after those of another."""
+
+    teacher: Path = checkpoint.SHIPPED
+    """Checkpoint of a network of the same width, headings and scale."""
+
+
+def begun(student: DSOM, teacher: DSOM) -> DSOM:
+    """``student`` with the teacher's map encoder, and of its decoder the weights for inputs that both have."""
+    graph, *own = split_model(student)
+    for mine, given in zip(own, split_model(teacher)[1:], strict=True):
+        mine["environment"]["stages"] = jax.tree.map(jnp.copy, given["environment"]["stages"])
+        mine["decoder"] = jax.tree.map(common, mine["decoder"], given["decoder"])
+    return nnx.merge(graph, *own)
+
+
+def common(mine: Array, given: Array) -> Array:
+    """The leading part of ``given`` that has the shape of ``mine``: further inputs come last."""
+    return jnp.copy(given[tuple(slice(0, size) for size in mine.shape)])
+
+
+def coarse(model: DSOM, batch: Batch, config: TrainConfig) -> Array:
+    """Coarse SIM (N, S, h, w, K), sharpened; without panorama and decoder."""
+    features, indices = model.environment(batch.occupied)
+    observe = jax.vmap(jax.vmap(lambda r, c: model.observation(r, config.scan.lidar, c)))
+    maps = MapFeatures(features, indices, None, batch.free)
+    return model.similarity(maps, observe(batch.ranges, batch.conditions)).coarse
+
+
+def standard(x: Array) -> Array:
+    """Each SIM of x (N, S, h, w, K) with mean zero and length one."""
+    x = x - x.mean(PLACES, keepdims=True)
+    return x * jax.lax.rsqrt((x * x).sum(PLACES, keepdims=True) + 1e-6)
+
+
+def imitation(similarity: Array, given: Array) -> tuple[Array, Array]:
+    """How far SIM is from the teacher's (N, S, h, w, K): mean correlation, and cross-entropy of the softmaxes."""
+    truth = jax.nn.softmax(given, axis=PLACES)
+    entropy = -(truth * jax.nn.log_softmax(similarity, axis=PLACES)).sum(PLACES)
+    return (standard(similarity) * standard(given)).sum(PLACES).mean(), entropy.mean()
+
+
+def make_step(config: TrainConfig, teacher: DSOM) -> Callable[..., tuple[TrainState, dict[str, Array]]]:
+    """The jitted step of :func:`dsom_jax.training.loop.make_step` with the teacher in place of Eq 5."""
+    graphdef = split_model(nnx.eval_shape(lambda: create(config.model)))[0]
+
+    def objective(params: Any, stats: Any, batch: Batch) -> tuple[Array, tuple[dict[str, Array], Any]]:
+        model = nnx.merge(graphdef, params, stats)
+        similarity, given = coarse(model, batch, config), coarse(teacher, batch, config)
+        likeness, imitated = imitation(similarity, jax.lax.stop_gradient(given))
+        shape = (batch.free.shape[1], batch.free.shape[2])
+        target = make_target(batch.poses, shape, config.model.headings, config.model.resolution, config.blur)
+        found = similarity_loss(similarity, target, batch.free[:, None])
+        total = LIKENESS * (1 - likeness) + imitated + found
+        facts = {"total": total, "likeness": likeness, "imitated": imitated, "similarity": found}
+        return total, (facts, nnx.as_pure(nnx.state(model, nnx.BatchStat)))
+
+    def step(state: TrainState, batch: Batch, total: Array) -> tuple[TrainState, dict[str, Array]]:
+        (_, (facts, stats)), gradient = jax.value_and_grad(objective, has_aux=True)(state.params, state.stats, batch)
+        params, moments, more = descend(config, state.step, total, state.params, state.optimizer, gradient)
+        average = follow_average(config, state.step, state.average, (params, stats))
+        return TrainState(state.step + 1, params, stats, moments, average), {**facts, **more}
+
+    return jax.jit(step, donate_argnums=0, compiler_options=training_options())
+
+
+def main() -> None:
+    """Entry point."""
+    args = parse(Args, "python experiments/dsom/distil.py")
+    keep_freed_memory()
+    run, material = open_run(args)
+    teacher = checkpoint.load(args.teacher)
+    # As `--init` does, a run that has saved a state goes on from that.
+    first = None if run.states() else begun(create(run.config.model, run.config.seed), teacher)
+    step = make_step(run.config, teacher)
+    train(args, run, lambda: parts(run, Material(material.grids, first))._replace(step=step, shown=("likeness", "r")))
+
+
+if __name__ == "__main__":
+    run_cli(main)
