@@ -47,9 +47,7 @@ def jobs(config: Config) -> dict[str, Any]:
 def compare(name: str, config: Config, lab: Lab) -> dict[str, Any]:
     """One method on all sequences: its entry of ``bench.json``, every run, and E_pos over time."""
     settings = bench.Settings(config.runs, config.particles, config.t_cut, lab.seed, config.weight_power)
-    build = partial(lab.build, particles=config.particles, t_cut=config.t_cut, weight_power=config.weight_power)
-    record = bench.run_method(name, lab.suite, lab.keys(config.runs), build)
-    entry = bench.summary(lab.suite, {name: record}, settings)["methods"][name]
+    entry, record = lab.compare(name, settings)
     return {"summary": entry, "runs": rows(record.table), "evolution": [band(trace) for trace in record.traces],
             "kidnapped": kidnappings(lab)}  # fmt: skip
 

@@ -13,7 +13,7 @@ import platform
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -21,7 +21,7 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-from dsom_jax import checkpoint, report
+from dsom_jax import bench, checkpoint, report
 from dsom_jax.compiling import run_options
 from dsom_jax.data.suite import Suite, load_suite
 from dsom_jax.episode import Episode
@@ -103,6 +103,13 @@ class Lab:
         return jax.block_until_ready(
             build_filter(name, grid, self.suite.lidar, **own, checkpoint=network, sources=made)
         )
+
+    def compare(self, name: str, settings: bench.Settings) -> tuple[dict[str, Any], bench.Record]:
+        """A method on all sequences: its entry of ``bench.json``, and all of its runs."""
+        chosen = {"particles": settings.particles, "t_cut": settings.t_cut, "weight_power": settings.weight_power}
+        build: bench.Build = partial(self.build, **chosen)  # type: ignore[arg-type]
+        record = bench.run_method(name, self.suite, self.keys(settings.runs), build)
+        return bench.summary(self.suite, {name: record}, settings)["methods"][name], record
 
 
 Job = Callable[[Lab], dict[str, Any]]

@@ -34,10 +34,7 @@ def jobs(config: Config) -> dict[str, Any]:
 
 def vary(count: int, config: Config, lab: Lab) -> dict[str, Any]:
     """AdaM + DSOM with ``count`` particles on all sequences."""
-    build = partial(lab.build, particles=count, t_cut=config.t_cut)
-    record = bench.run_method(METHOD, lab.suite, lab.keys(config.runs), build)
-    settings = bench.Settings(config.runs, count, config.t_cut, lab.seed)
-    entry = bench.summary(lab.suite, {METHOD: record}, settings)["methods"][METHOD]
+    entry, record = lab.compare(METHOD, bench.Settings(config.runs, count, config.t_cut, lab.seed))
     return {"summary": entry, "runs": rows(record.table)}
 
 

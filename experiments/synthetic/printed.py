@@ -35,13 +35,9 @@ def jobs(config: Config) -> dict[str, Any]:
 
 def run(name: str, config: Config, lab: Lab) -> dict[str, Any]:
     """One method on all sequences."""
-    shared = {"particles": config.particles, "t_cut": config.t_cut, "weight_power": config.weight_power}
-    record = bench.run_method(name, lab.suite, lab.keys(config.runs), partial(lab.build, **shared))  # type: ignore[arg-type]
-    settings = bench.Settings(runs=config.runs, seed=lab.seed, **shared)  # type: ignore[arg-type]
-    return {
-        "summary": bench.summary(lab.suite, {name: record}, settings)["methods"][name],
-        "runs": rows(record.table),
-    }
+    settings = bench.Settings(config.runs, config.particles, config.t_cut, lab.seed, config.weight_power)
+    entry, record = lab.compare(name, settings)
+    return {"summary": entry, "runs": rows(record.table)}
 
 
 def section(everything: Everything) -> str:
