@@ -52,8 +52,8 @@ def weights(folder: Path) -> bytes:
 def test_a_run_that_lost_its_end_resumes_bit_for_bit(files, monkeypatch):
     made, parts = [], train_filter.parts
 
-    def compiled_once(run):
-        made.append(made[0] if made else parts(run))
+    def compiled_once(run, grids):
+        made.append(made[0] if made else parts(run, grids))
         return made[0]._replace(state=train_filter.first_state(run))
 
     def blank_windows(key, pool, config, resolution, count, strays):

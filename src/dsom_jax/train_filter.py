@@ -73,18 +73,19 @@ def training_maps(paths: tuple[str, ...], resolution: float) -> list[OccupancyGr
     return list(tests.values())
 
 
-def open_run(args: Arguments) -> FilterRun:
-    """A new run in an empty folder, or the one to resume."""
+def open_run(args: Arguments) -> tuple[FilterRun, list[OccupancyGrid]]:
+    """A new run in an empty folder, or the one to resume, and the maps it is trained on."""
     path, out = args.folder / "run.json", args.folder
     if args.resume and path.exists():
-        return resume_run(args, path)
+        run = resume_run(args, path)
+        return run, training_maps(run.maps, run.config.model.resolution)
     check_new(out, args.resume)
     config = args.read_config(read_yaml(args.config), str(args.config))
     run = FilterRun(out, config, tuple(str(p) for p in args.maps), args.steps)
-    # Read once before anything is written: a bad map leaves no folder behind.
-    training_maps(run.maps, config.model.resolution)
+    # Before anything is written: a bad map leaves no folder behind.
+    grids = training_maps(run.maps, config.model.resolution)
     create(run)
-    return run
+    return run, grids
 
 
 def resume_run(args: Arguments, path: Path) -> FilterRun:
@@ -114,9 +115,9 @@ def make_batches(run: Run, grids: list[OccupancyGrid]) -> tuple[Callable[[int, i
     return lambda step, total: batch(jnp.int32(step)), stack_maps(pool, resolution)
 
 
-def parts(run: Run) -> Parts:
+def parts(run: Run, maps: list[OccupancyGrid]) -> Parts:
     """Batches, step and evaluation of a run."""
-    grids = [replace(g, origin=jnp.zeros(3)) for g in training_maps(run.maps, run.config.model.resolution)]
+    grids = [replace(grid, origin=jnp.zeros(3)) for grid in maps]
     batches, places = make_batches(run, grids)
     step, evaluate = make_filter_step(run.config, places), make_tracking(run.config, grids)
     return Parts(batches, step, evaluate, first_state(run), ("prediction", "prediction"))
@@ -126,8 +127,8 @@ def main() -> None:
     """Entry point."""
     args = parse(Arguments, "python -m dsom_jax.train_filter")
     keep_freed_memory()
-    run = open_run(args)
-    train(args, run, lambda: parts(run))
+    run, grids = open_run(args)
+    train(args, run, lambda: parts(run, grids))
 
 
 if __name__ == "__main__":
