@@ -1,6 +1,6 @@
 """Killed twenty times, training ends with the numbers of a run left alone: ``python experiments/dsom/kills.py``.
 
-A tiny network on procedural buildings, saved every second step. Every start is killed with SIGKILL within five seconds
+A tiny network on procedural buildings, saved every second step. Every start is killed with SIGKILL within ten seconds
 of its first step; then losses and weights are compared bit for bit. Writes ``results/kills.json``.
 """
 
@@ -76,7 +76,7 @@ def main(kills: int = 20, steps: int = 150, seed: int = 0) -> None:
         if start(folder, "whole", steps).wait():
             raise SystemExit("the run that is left alone failed")
         while done < kills:
-            done += kill_soon(start(folder, "killed", steps), folder / "killed" / "metrics.jsonl", luck.uniform(0, 5.0))
+            done += kill_soon(start(folder, "killed", steps), folder / "killed" / "metrics.jsonl", luck.uniform(0, 10.0))
             left = steps - len(numbers(folder / "killed"))
             print(f"killed {done} times, {left} steps left", flush=True)
             if left <= 2:
