@@ -117,3 +117,29 @@ def test_unwritable(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match="cannot write the checkpoint"):
         checkpoint.save(tmp_path / "file" / "x", create(CONFIG))
+
+
+SHIPPED = sorted(checkpoint.SHIPPED.parent.iterdir())
+
+
+@pytest.mark.parametrize("folder", SHIPPED, ids=lambda folder: folder.name)
+def test_what_is_shipped_loads_and_says_how_it_came_about(folder):
+    record = json.loads((folder / "provenance.json").read_text())
+    kind = record.get("kind", "dsom")
+    weights = jax.tree.leaves(checkpoint.load(folder, kind=kind))
+    assert weights and all(np.isfinite(np.asarray(x)).all() for x in weights)
+    assert len(record["commit"]) == 40 and record["steps"] > 0 and record["samples"] > 0 and record["metrics"]
+    assert [path.name for path in folder.iterdir() if path.is_dir()] == [record["weights"]]
+    # Orbax writes down where it saved; that is no path of the machine it was trained on.
+    assert not any(b"/" in path.read_bytes() for path in folder.rglob("commit_success.txt"))
+
+
+def test_networks_for_full_turns_refuse_half_of_one():
+    half = LidarConfig(180, -math.pi / 2, math.radians(1), 0.0, 10.0)
+    with pytest.raises(UserError, match="field of view 180 deg, trained for 360 or more"):
+        checkpoint.load(checkpoint.SHIPPED.with_name("dsom-paper"), half)
+
+
+def test_what_is_shipped_is_small():
+    sizes = [path.stat().st_size for folder in SHIPPED for path in folder.rglob("*") if path.is_file()]
+    assert len(SHIPPED) == 4 and sum(sizes) < 40e6
