@@ -76,7 +76,9 @@ def main(kills: int = 20, steps: int = 150, seed: int = 0) -> None:
         if start(folder, "whole", steps).wait():
             raise SystemExit("the run that is left alone failed")
         while done < kills:
-            done += kill_soon(start(folder, "killed", steps), folder / "killed" / "metrics.jsonl", luck.uniform(0, 10.0))
+            done += kill_soon(
+                start(folder, "killed", steps), folder / "killed" / "metrics.jsonl", luck.uniform(0, 10.0)
+            )
             left = steps - len(numbers(folder / "killed"))
             print(f"killed {done} times, {left} steps left", flush=True)
             if left <= 2:
