@@ -10,7 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from dsom_jax import checkpoint
+from dsom_jax.errors import UserError
 from dsom_jax.nn import DSOMConfig, create
+from dsom_jax.training.loop import TrainConfig
 
 FOLDER = Path(__file__).resolve().parents[1] / "experiments" / "dsom"
 
@@ -66,3 +69,10 @@ def test_every_scan_is_standardised_alone(distil):
     out = np.asarray(distil.standard(x)).reshape(2, 8)
     expected = (np.arange(8) - 3.5) / np.sqrt(((np.arange(8) - 3.5) ** 2).sum())
     np.testing.assert_allclose(out, [expected, -expected], atol=1e-4)
+
+
+def test_a_teacher_of_another_size_is_refused(distil, tmp_path):
+    checkpoint.save(tmp_path, networks()[1])
+    config = TrainConfig(model=DSOMConfig(width=3, headings=4, encoder="paper", reach_min=5.0))
+    with pytest.raises(UserError, match=r"model\.width is 2, the run's is 3"):
+        distil.read_teacher(tmp_path, config)

@@ -1,9 +1,9 @@
 """The paper's scan encoder learns from the polar one: ``python experiments/dsom/distil.py --teacher checkpoints/dsom``.
 
-From one-hot places alone the paper's network needs days of processor time on two cores. Here its coarse SIM follows
-that of a trained network, cell by cell and heading by heading, besides the truth; the map encoder and what fits of the
-decoder begin with the teacher's weights. What comes out begins the training with Eq 5, by ``train --init``. All other
-options, and what the folder holds, are those of ``python -m dsom_jax.train``.
+From places alone the paper's network learns little in the hours that two cores allow (``REPORT.md``). Here its coarse
+SIM follows that of a trained network, cell by cell and heading by heading, besides the truth; the map encoder and what
+fits of the decoder begin with the teacher's weights. What comes out begins the training with Eq 5, by ``train --init``.
+All other options, and what the folder holds, are those of ``python -m dsom_jax.train``.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from flax import nnx
 from dsom_jax import checkpoint
 from dsom_jax.cli import parse
 from dsom_jax.compiling import training_options
-from dsom_jax.errors import run_cli
+from dsom_jax.errors import UserError, run_cli
 from dsom_jax.nn import DSOM, create
 from dsom_jax.nn.dsom import MapFeatures
 from dsom_jax.train import Arguments, Material, open_run, parts
@@ -43,6 +43,18 @@ class Args(Arguments):
 
     teacher: Path = checkpoint.SHIPPED
     """Checkpoint of a network of the same width, headings and scale."""
+
+
+def read_teacher(path: Path, config: TrainConfig) -> DSOM:
+    """The network to imitate; UserError if its features are not of the student's size and scale."""
+    teacher: DSOM = checkpoint.load(path, resolution=config.model.resolution)
+    for name in ("width", "headings"):
+        own, wanted = getattr(teacher.config, name), getattr(config.model, name)
+        if own != wanted:
+            raise UserError(
+                f"--teacher {path}: field model.{name} is {own}, the run's is {wanted}; give another --config"
+            )
+    return teacher
 
 
 def begun(student: DSOM, teacher: DSOM) -> DSOM:
@@ -109,7 +121,7 @@ def main() -> None:
     args = parse(Args, "python experiments/dsom/distil.py")
     keep_freed_memory()
     run, material = open_run(args)
-    teacher = checkpoint.load(args.teacher)
+    teacher = read_teacher(args.teacher, run.config)
     # As `--init` does, a run that has saved a state goes on from that.
     first = None if run.states() else begun(create(run.config.model, run.config.seed), teacher)
     step = make_step(run.config, teacher)
