@@ -12,8 +12,10 @@ import pytest
 
 from dsom_jax import checkpoint
 from dsom_jax.errors import UserError
-from dsom_jax.nn import DSOMConfig, create
-from dsom_jax.training.loop import TrainConfig
+from dsom_jax.nn import DSOMConfig, create, evaluation_view
+from dsom_jax.nn.polar import Conditions
+from dsom_jax.training.batches import Batch, ScanConfig
+from dsom_jax.training.loop import TrainConfig, split_model
 
 FOLDER = Path(__file__).resolve().parents[1] / "experiments" / "dsom"
 
@@ -46,11 +48,30 @@ def test_it_begins_with_the_map_encoder_and_the_decoder_of_the_teacher(distil):
     np.testing.assert_array_equal(new.scan.stages[0].blocks[0].kernel[...], own)
 
 
-def test_the_teacher_keeps_its_buffers(distil):
+def test_no_buffer_is_shared_with_the_teacher(distil):
+    """The step gives away the student's buffers."""
     student, teacher = networks()
-    begun = distil.begun(student, teacher)
-    jax.tree.map(lambda x: x.delete(), begun.environment.stages[0].blocks[0].kernel[...])
-    assert np.isfinite(teacher.environment.stages[0].blocks[0].kernel[...]).all()
+    mine, given = (
+        {x.unsafe_buffer_pointer() for x in jax.tree.leaves(split_model(m)[1:])}
+        for m in (distil.begun(student, teacher), teacher)
+    )
+    assert len(mine) > 50 and not mine & given
+
+
+def test_who_is_the_teacher_has_nothing_to_imitate(distil):
+    model = evaluation_view(networks()[0])
+    config = TrainConfig(model=model.config, scan=ScanConfig(beams=24))
+    room = jnp.zeros((2, 16, 16), bool).at[:, 0].set(True).at[1, 8, 4:].set(True)
+    ranges = jax.random.uniform(jax.random.key(0), (2, 3, 24), maxval=8.0)
+    poses = jax.random.uniform(jax.random.key(1), (2, 3, 3), minval=1.0, maxval=4.0)
+    batch = Batch(room, ~room, ranges, Conditions(jnp.full((2, 3), 10.0), jnp.full((2, 3), 0.26)), poses)
+    found = distil.losses(model, batch, config, model)
+    assert float(found.likeness) == pytest.approx(1.0, abs=1e-4)
+    other = distil.losses(evaluation_view(create(model.config, 5)), batch, config, model)
+    assert float(other.likeness) < 0.9 and float(other.imitated) > float(found.imitated)
+    for one in (found, other):
+        expected = distil.LIKENESS * (1 - one.likeness) + one.imitated + one.similarity
+        assert float(one.total) == pytest.approx(float(expected), rel=1e-6)
 
 
 def test_imitation_does_not_see_scale_and_level_in_the_likeness_but_in_the_softmax(distil):

@@ -8,10 +8,10 @@ All other options, and what the folder holds, are those of ``python -m dsom_jax.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,15 +19,13 @@ from flax import nnx
 
 from dsom_jax import checkpoint
 from dsom_jax.cli import parse
-from dsom_jax.compiling import training_options
 from dsom_jax.errors import UserError, run_cli
 from dsom_jax.nn import DSOM, create
 from dsom_jax.nn.dsom import MapFeatures
 from dsom_jax.train import Arguments, Material, open_run, parts
 from dsom_jax.trainer import train
 from dsom_jax.training.batches import Batch
-from dsom_jax.training.descent import descend, follow_average
-from dsom_jax.training.loop import TrainConfig, TrainState, split_model
+from dsom_jax.training.loop import TrainConfig, make_step, split_model
 from dsom_jax.training.loss import PLACES, similarity_loss
 from dsom_jax.training.memory import keep_freed_memory
 from dsom_jax.training.target import make_target
@@ -92,28 +90,23 @@ def imitation(similarity: Array, given: Array) -> tuple[Array, Array]:
     return (standard(similarity) * standard(given)).sum(PLACES).mean(), entropy.mean()
 
 
-def make_step(config: TrainConfig, teacher: DSOM) -> Callable[..., tuple[TrainState, dict[str, Array]]]:
-    """The jitted step of :func:`dsom_jax.training.loop.make_step` with the teacher in place of Eq 5."""
-    graphdef = split_model(nnx.eval_shape(lambda: create(config.model)))[0]
+class Imitation(NamedTuple):
+    """Means over a batch: what is minimised, both parts of :func:`imitation`, and the cross-entropy to the truth."""
 
-    def objective(params: Any, stats: Any, batch: Batch) -> tuple[Array, tuple[dict[str, Array], Any]]:
-        model = nnx.merge(graphdef, params, stats)
-        similarity, given = coarse(model, batch, config), coarse(teacher, batch, config)
-        likeness, imitated = imitation(similarity, jax.lax.stop_gradient(given))
-        shape = (batch.free.shape[1], batch.free.shape[2])
-        target = make_target(batch.poses, shape, config.model.headings, config.model.resolution, config.blur)
-        found = similarity_loss(similarity, target, batch.free[:, None])
-        total = LIKENESS * (1 - likeness) + imitated + found
-        facts = {"total": total, "likeness": likeness, "imitated": imitated, "similarity": found}
-        return total, (facts, nnx.as_pure(nnx.state(model, nnx.BatchStat)))
+    total: Array
+    likeness: Array
+    imitated: Array
+    similarity: Array
 
-    def step(state: TrainState, batch: Batch, total: Array) -> tuple[TrainState, dict[str, Array]]:
-        (_, (facts, stats)), gradient = jax.value_and_grad(objective, has_aux=True)(state.params, state.stats, batch)
-        params, moments, more = descend(config, state.step, total, state.params, state.optimizer, gradient)
-        average = follow_average(config, state.step, state.average, (params, stats))
-        return TrainState(state.step + 1, params, stats, moments, average), {**facts, **more}
 
-    return jax.jit(step, donate_argnums=0, compiler_options=training_options())
+def losses(model: DSOM, batch: Batch, config: TrainConfig, teacher: DSOM) -> Imitation:
+    """What takes the place of Eq 5 and its auxiliary loss."""
+    similarity, given = coarse(model, batch, config), coarse(teacher, batch, config)
+    likeness, imitated = imitation(similarity, jax.lax.stop_gradient(given))
+    shape = (batch.free.shape[1], batch.free.shape[2])
+    target = make_target(batch.poses, shape, config.model.headings, config.model.resolution, config.blur)
+    found = similarity_loss(similarity, target, batch.free[:, None])
+    return Imitation(LIKENESS * (1 - likeness) + imitated + found, likeness, imitated, found)
 
 
 def main() -> None:
@@ -124,7 +117,7 @@ def main() -> None:
     teacher = read_teacher(args.teacher, run.config)
     # As `--init` does, a run that has saved a state goes on from that.
     first = None if run.states() else begun(create(run.config.model, run.config.seed), teacher)
-    step = make_step(run.config, teacher)
+    step = make_step(run.config, partial(losses, teacher=teacher))
     train(args, run, lambda: parts(run, Material(material.grids, first))._replace(step=step, shown=("likeness", "r")))
 
 

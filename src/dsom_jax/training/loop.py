@@ -151,13 +151,18 @@ def batch_losses(model: DSOM, batch: Batch, config: TrainConfig) -> Losses:
     return dsom_losses(outputs, target, batch.free, config.similarity_weight)
 
 
-def make_step(config: TrainConfig) -> Callable[[TrainState, Batch, Array], tuple[TrainState, dict[str, Array]]]:
-    """The jitted step: (state, batch, total steps) -> (state, metrics). The state given is consumed."""
+def make_step(
+    config: TrainConfig, measure: Callable[[DSOM, Batch, TrainConfig], Any] = batch_losses
+) -> Callable[[TrainState, Batch, Array], tuple[TrainState, dict[str, Array]]]:
+    """The jitted step: (state, batch, total steps) -> (state, metrics). The state given is consumed.
+
+    ``measure`` gives a named tuple whose ``total`` is minimised; all of it becomes metrics.
+    """
     graphdef = split_model(nnx.eval_shape(lambda: create(config.model)))[0]
 
-    def objective(params: Any, stats: Any, batch: Batch) -> tuple[Array, tuple[Losses, Any]]:
+    def objective(params: Any, stats: Any, batch: Batch) -> tuple[Array, tuple[Any, Any]]:
         model = nnx.merge(graphdef, params, stats)
-        losses = batch_losses(model, batch, config)
+        losses = measure(model, batch, config)
         return losses.total, (losses, nnx.as_pure(nnx.state(model, nnx.BatchStat)))
 
     def step(state: TrainState, batch: Batch, total: Array) -> tuple[TrainState, dict[str, Array]]:
