@@ -265,8 +265,8 @@ TRAIN = ("--config", "tiny.yaml", "--steps", "2", "--out", "out")
 @pytest.mark.parametrize(
     ("words", "fragments"),
     [
-        (("--config", "nowhere.yaml"), ["nowhere.yaml", "cannot read"]),
-        (("--config", "room.pgm"), ["room.pgm", "cannot read"]),
+        (("--config", "nowhere.yaml"), ["nowhere.yaml", "no such configuration"]),
+        (("--config", "room.pgm"), ["room.pgm", "not valid YAML"]),
         (("--config", "nan.yaml"), ["nan.yaml", "TrainConfig.learning_rate = nan"]),
         (("--config", "pair.yaml"), ["pair.yaml", "scan: obstacles", "expected 2 values"]),
         (("--maps", "nowhere.yaml"), ["nowhere.yaml", "no such map yaml"]),

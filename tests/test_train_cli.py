@@ -101,8 +101,8 @@ def test_bad_input_is_one_line_and_exit_code_2(files):
         ("colour: 1", "unknown field colour"),
         ("model: {width: wide}", "model: width: expected int"),
         ("early: {cells: 12}", "multiple of 8"),
-        ("- 1", "expected fields of TrainConfig"),
-        ("a: [", "cannot read the configuration"),
+        ("- 1", "holds no fields"),
+        ("a: [", "not valid YAML at line 1"),
     ],
 )
 def test_bad_configurations(tmp_path, text, message):

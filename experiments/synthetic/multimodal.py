@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from lab import PROPOSALS, Everything, Lab, Piece, compiled
+from lab import PROPOSALS, Everything, Lab, Piece, compiled, in_threads
 from matplotlib.figure import Figure
 from scenes import WORLD, Change, Condition, building, take
 from symmetric import images, off_middle, symmetric
@@ -25,7 +25,7 @@ from dsom_jax.occupancy import OccupancyGrid, from_cells
 from dsom_jax.plotting.common import legend
 from dsom_jax.statistics import clustered_bootstrap
 from dsom_jax.training import quality
-from dsom_jax.types import Array, Inputs, Proposal
+from dsom_jax.types import Array, Inputs, Key, Proposal
 
 NAME = "multimodal"
 _UNSEEN = 0x3A5E
@@ -94,22 +94,22 @@ def typical(peaks: list[int], mass: list[float]) -> dict[str, int]:
 
 def judge_order(order: int, config: Config, lab: Lab) -> dict[str, Any]:
     """Peaks and probability at each right pose in buildings of one order of symmetry, scans that fit the map."""
-    root = jax.random.fold_in(jax.random.key(lab.seed), _UNSEEN)
-    found: dict[str, list[Any]] = {name: [] for name in PROPOSALS}
-    pictures: dict[str, Any] = {}
-    for key in jax.random.split(root, config.worlds):
-        k_world, k_scans = jax.random.split(key)
-        grid = symmetric(building(k_world, WORLD), order)
-        stand = OccupancyGrid(grid.occupied, grid.free & off_middle(grid, config.apart), grid.origin, grid.resolution)
-        scans = take(k_scans, stand, grid, Condition(Change(obstacles=0)), config.scans)
-        right = images(grid, scans.poses, order)
-        made = proposals(lab, grid)
-        for name in PROPOSALS:
-            found[name].append(jax.tree.map(np.asarray, _shares()(made[name], scans.ranges, right)))
-        pictures = pictures or {
-            str(order): picture(made["dsom"], grid, scans.ranges[0], scans.poses[0], lab.suite.lidar)
-        }
-    return {"order": order, "pictures": pictures, **{name: told(parts, order) for name, parts in found.items()}}
+    keys = jax.random.split(jax.random.fold_in(jax.random.key(lab.seed), _UNSEEN), config.worlds)
+    worlds = in_threads(lambda n: judge_building(order, config, lab, keys[n], drawn=n == 0), range(config.worlds))
+    numbers = {name: told([found[name] for found, _ in worlds], order) for name in PROPOSALS}
+    return {"order": order, "pictures": {str(order): worlds[0][1]}, **numbers}
+
+
+def judge_building(order: int, config: Config, lab: Lab, key: Key, drawn: bool) -> tuple[dict[str, Any], Any]:
+    """What :func:`shares` gives in one building, by proposal; the picture of a scan, if ``drawn``."""
+    k_world, k_scans = jax.random.split(key)
+    grid = symmetric(building(k_world, WORLD), order)
+    stand = OccupancyGrid(grid.occupied, grid.free & off_middle(grid, config.apart), grid.origin, grid.resolution)
+    scans = take(k_scans, stand, grid, Condition(Change(obstacles=0)), config.scans)
+    right, made = images(grid, scans.poses, order), proposals(lab, grid)
+    found = {name: jax.tree.map(np.asarray, _shares()(made[name], scans.ranges, right)) for name in PROPOSALS}
+    shown = picture(made["dsom"], grid, scans.ranges[0], scans.poses[0], lab.suite.lidar) if drawn else None
+    return found, shown
 
 
 @cache

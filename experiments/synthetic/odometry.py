@@ -16,6 +16,8 @@ from tables import markdown, percent
 
 from dsom_jax import metrics
 from dsom_jax.bench import judge, judged_by
+from dsom_jax.episode import Episode
+from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.plotting.charts import STYLES
 from dsom_jax.plotting.common import legend
 
@@ -43,19 +45,27 @@ def jobs(config: Config) -> dict[str, Any]:
 
 def disturb(name: str, config: Config, lab: Lab) -> dict[str, Any]:
     """Summaries of one method by factor."""
-    parts: dict[float, dict[str, list[metrics.Runs]]] = {f: {p: [] for p in PHASES} for f in config.factors}
-    for sequence, (where, grid, episode) in enumerate(lab.suite.episodes):
-        filter = lab.build(name, where, grid, episode, config.particles)
-        keys = lab.keys(config.runs)[sequence]
-        results = run_all(filter, noisier, config.factors, with_error(episode), keys)
-        for factor, result in zip(config.factors, results, strict=True):
-            for phase, runs in judge(result, episode, judged_by(name)).items():
-                parts[factor][phase] += runs
-    summaries = {
-        f"{factor:g}": {phase: metrics.summarize(metrics.pool(runs)) for phase, runs in by_phase.items()}
-        for factor, by_phase in parts.items()
+    sequences = lab.by_sequence(partial(follow, name, config, lab))
+    return {
+        "by_factor": {
+            f"{factor:g}": {phase: summary([runs[phase] for runs in parts]) for phase in PHASES}
+            for factor, parts in zip(config.factors, zip(*sequences, strict=True), strict=True)
+        }
     }
-    return {"by_factor": summaries}
+
+
+def follow(
+    name: str, config: Config, lab: Lab, number: int, where: str, grid: OccupancyGrid, episode: Episode
+) -> list[dict[str, list[metrics.Runs]]]:
+    """The runs of one method on one sequence: by factor, then by phase."""
+    filter, keys = lab.build(name, where, grid, episode, config.particles), lab.keys(config.runs)[number]
+    results = run_all(filter, noisier, config.factors, with_error(episode), keys)
+    return [judge(result, episode, judged_by(name)) for result in results]
+
+
+def summary(parts: list[list[metrics.Runs]]) -> dict[str, Any]:
+    """The runs of one phase on all sequences, summarised."""
+    return metrics.summarize(metrics.pool([runs for part in parts for runs in part]))
 
 
 def figures(everything: Everything) -> dict[str, Figure]:

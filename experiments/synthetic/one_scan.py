@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 import jax
 import numpy as np
-from lab import PROPOSALS, Everything, Lab, Piece, column
+from lab import PROPOSALS, Everything, Lab, Piece, column, in_threads
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scenes import Change, Condition, Scans, beams_of, map_and_building, take
@@ -102,9 +100,7 @@ class Bed:
             root = jax.random.fold_in(jax.random.key(lab.seed), _UNSEEN)
             keys = jax.random.split(root, self.config.worlds)
             network = lab.networks["dsom"]
-            # One scan after the other keeps one core busy; buildings share nothing but what is compiled.
-            with ThreadPoolExecutor(os.cpu_count()) as pool:
-                worlds = list(pool.map(lambda n: self.world(n, keys[n], condition, network), range(len(keys))))
+            worlds = in_threads(lambda n: self.world(n, keys[n], condition, network), range(len(keys)))
             parts = {name: [found[name] for _, found in worlds] for name in PROPOSALS}
             self.judged[condition] = {name: told(part) for name, part in parts.items()}
             self.judged[condition]["contradicting"] = beams_of([scans for scans, _ in worlds])

@@ -51,19 +51,25 @@ def jobs(config: Config) -> dict[str, Any]:
 def keep(name: str, config: Config, lab: Lab) -> dict[str, Any]:
     """Results, all runs, and departures of one filter, by T_cut; the robust filter has none and stands under "-"."""
     adam = COMBINATIONS[name][0] == "adam"
-    labels = [f"{t:g}" for t in config.t_cuts] if adam else ["-"]
-    parts: dict[str, list[Part]] = {label: [] for label in labels}
-    for sequence, (where, grid, episode) in enumerate(lab.suite.episodes):
-        filter = lab.build(name, where, grid, episode, config.particles)
-        keys = lab.keys(config.runs)[sequence]
-        results = run_all(filter, other_t_cut, config.t_cuts, episode, keys) if adam else [run(filter, episode, keys)]
-        # Alg 1 and AdaM robust draw from the same proposals.
-        which = COMBINATIONS[name][1], sequence
-        scene = lab.scenes[which] = lab.scenes.get(which) or scene_of(lab, filter, where, grid, episode)
-        for label, result in zip(labels, results, strict=True):
-            parts[label].append(Part(name, sequence, episode, result, scene))
     cuts = config.t_cuts if adam else (None,)
-    return {"by_t_cut": {label: told(found, cut) for (label, found), cut in zip(parts.items(), cuts, strict=True)}}
+    sequences = lab.by_sequence(partial(follow, name, config, lab))
+    by_cut = zip(cuts, zip(*sequences, strict=True), strict=True)
+    return {"by_t_cut": {"-" if cut is None else f"{cut:g}": told(list(parts), cut) for cut, parts in by_cut}}
+
+
+def follow(
+    name: str, config: Config, lab: Lab, number: int, where: str, grid: OccupancyGrid, episode: Episode
+) -> list[Part]:
+    """The runs of one filter on one sequence, by T_cut."""
+    filter, keys = lab.build(name, where, grid, episode, config.particles), lab.keys(config.runs)[number]
+    if COMBINATIONS[name][0] == "adam":
+        results = run_all(filter, other_t_cut, config.t_cuts, episode, keys)
+    else:
+        results = [run(filter, episode, keys)]
+    # Alg 1 and AdaM robust draw from the same proposals.
+    which = COMBINATIONS[name][1], number
+    scene = lab.scenes[which] = lab.scenes.get(which) or scene_of(lab, filter, where, grid, episode)
+    return [Part(name, number, episode, result, scene) for result in results]
 
 
 def scene_of(lab: Lab, filter: Any, where: str, grid: OccupancyGrid, episode: Episode) -> Scene:

@@ -10,10 +10,9 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
-import yaml
-
 from dsom_jax import checkpoint
 from dsom_jax.atomic import write_atomic
+from dsom_jax.data.files import read_yaml
 from dsom_jax.errors import UserError
 from dsom_jax.training.filter_loop import averaged_filter_model
 from dsom_jax.training.loop import averaged_model, late_start
@@ -106,14 +105,9 @@ class FilterRun(Run):
         return step * self.config.batch * self.config.data.window
 
 
-def read_yaml(path: Path | None) -> Any:
-    """Contents of a configuration file; nothing without one."""
-    if path is None:
-        return {}
-    try:
-        return yaml.safe_load(path.read_text()) or {}
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise UserError(f"{path}: cannot read the configuration ({error}); give a YAML file") from error
+def read_fields(path: Path | None) -> dict[str, Any]:
+    """Fields of a configuration file; none without one."""
+    return {} if path is None else read_yaml(path, "configuration")
 
 
 def create(run: Run) -> None:

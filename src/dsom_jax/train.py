@@ -14,7 +14,7 @@ from dsom_jax.data.open_map import load_maps
 from dsom_jax.errors import UserError, run_cli
 from dsom_jax.nn import DSOM
 from dsom_jax.occupancy import OccupancyGrid
-from dsom_jax.run_folder import Run, check_new, create, read_yaml, reopen
+from dsom_jax.run_folder import Run, check_new, create, read_fields, reopen
 from dsom_jax.trainer import Parts, check_length, train
 from dsom_jax.training.batches import make_batch, plain
 from dsom_jax.training.evaluation import make_evaluation
@@ -70,7 +70,7 @@ class Material(NamedTuple):
 
 def read_config(path: Path | None) -> TrainConfig:
     """TrainConfig from a YAML file with some of its fields."""
-    return override(TrainConfig(), read_yaml(path), str(path))
+    return override(TrainConfig(), read_fields(path), str(path))
 
 
 def open_run(args: Arguments) -> tuple[Run, Material]:

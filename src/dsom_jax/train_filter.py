@@ -17,7 +17,7 @@ from dsom_jax.data.suite import load_suite
 from dsom_jax.errors import UserError, run_cli
 from dsom_jax.nn import KINDS
 from dsom_jax.occupancy import OccupancyGrid
-from dsom_jax.run_folder import FilterRun, Run, check_new, create, read_yaml, reopen
+from dsom_jax.run_folder import FilterRun, Run, check_new, create, read_fields, reopen
 from dsom_jax.trainer import Parts, check_length, train
 from dsom_jax.training.filter_evaluation import make_tracking
 from dsom_jax.training.filter_loop import FilterTrainConfig, init_filter_state, make_filter_step, stack_maps
@@ -80,7 +80,7 @@ def open_run(args: Arguments) -> tuple[FilterRun, list[OccupancyGrid]]:
         run = resume_run(args, path)
         return run, training_maps(run.maps, run.config.model.resolution)
     check_new(out, args.resume)
-    config = args.read_config(read_yaml(args.config), str(args.config))
+    config = args.read_config(read_fields(args.config), str(args.config))
     run = FilterRun(out, config, tuple(str(p) for p in args.maps), args.steps)
     # Before anything is written: a bad map leaves no folder behind.
     grids = training_maps(run.maps, config.model.resolution)
@@ -91,7 +91,7 @@ def open_run(args: Arguments) -> tuple[FilterRun, list[OccupancyGrid]]:
 def resume_run(args: Arguments, path: Path) -> FilterRun:
     """The run described by run.json; UserError if it is of another filter or configuration."""
     run = reopen(FilterRun, path, lambda given: args.read_config(given, str(path)), args.maps, args.steps)
-    if args.config is not None and args.read_config(read_yaml(args.config), str(args.config)) != run.config:
+    if args.config is not None and args.read_config(read_fields(args.config), str(args.config)) != run.config:
         raise UserError(f"{args.config}: differs from the run in {path}; resume without --config")
     return run
 
