@@ -125,6 +125,28 @@ def test_range_max_override(tmp_path: Path) -> None:
     assert log.lidar.range_max == 5.0 and np.isposinf(log.ranges[:, 3]).all()
 
 
+@pytest.mark.parametrize("told", [np.inf, 0.0, np.nan])
+def test_scans_that_tell_no_range_max(tmp_path: Path, told: float) -> None:
+    entries = [(t, topic, kind, (*v, "laser", told) if kind == "scan" else v) for t, topic, kind, v in drive()]
+    log = load_bag(write_bag(tmp_path, "bag", entries))
+    assert log.lidar.range_max == pytest.approx(9.01) and log.ranges[0, 5] == 9.0 and np.isposinf(log.ranges[0, 6])
+    assert any("9.01 m is taken" in line for line in log.report.lines())
+
+
+def test_odometry_that_is_no_number_costs_its_own_message_only(tmp_path: Path) -> None:
+    entries = drive(n=8)
+    spoilt = [(t, top, kind, (np.nan, *v[1:]) if (kind, t) == ("odom", 10.4) else v) for t, top, kind, v in entries]
+    log = load_bag(write_bag(tmp_path, "bag", spoilt))
+    assert len(log) == 8 and log.report.counts["odometry messages that are not finite dropped"] == 1
+    np.testing.assert_allclose(log.odometry[:3, 0], [0.5, 1.5, 2.5], atol=1e-6)
+
+
+def test_a_laser_with_a_clock_of_its_own_is_told(tmp_path: Path) -> None:
+    entries = [(t - 9.0 if kind == "scan" else t, topic, kind, v) for t, topic, kind, v in drive()]
+    with pytest.raises(UserError, match=r"odometry from 10.000 to 10.800 s, scans from 1.100 to 1.900 s.*one clock"):
+        load_log(write_bag(tmp_path, "bag", entries))
+
+
 @pytest.mark.parametrize("name", ["a.bag", "a.db3", "a.mcap"])
 @pytest.mark.parametrize("content", [b"", b"not a bag at all, whatever its name says"])
 def test_broken_bags(tmp_path: Path, name: str, content: bytes) -> None:

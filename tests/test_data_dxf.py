@@ -11,6 +11,7 @@ from dsom_jax.data import load_map, save_ros_map, se2
 from dsom_jax.data.dxf import Drawing, load_drawing
 from dsom_jax.data.log import Report
 from dsom_jax.data.rasterize import enclosed, reachable, touched_cells
+from dsom_jax.errors import UserError
 from tiny_drawing import ROOM, free_at, load, occupied_at, room, write
 from tiny_world import grid as tiny_room
 
@@ -132,6 +133,32 @@ def test_what_is_left_out_is_reported(furnished):
     report = Report()
     load_drawing(furnished, Drawing(), report)
     assert report.lines() == ["1 TEXT entities not drawn"]
+
+
+def test_hidden_entities_and_blocks_that_are_not_there(tmp_path):
+    def draw(msp):
+        room(msp)
+        msp.doc.layers.add("FROZEN").freeze()
+        msp.doc.layers.add("OFF").off()
+        msp.doc.blocks.new("CHAIR").add_line((0, 0), (1, 0), dxfattribs={"layer": "WALLS"})
+        msp.add_blockref("CHAIR", (2, 1), dxfattribs={"layer": "FROZEN"})
+        msp.add_blockref("CHAIR", (2, 2), dxfattribs={"layer": "OFF"})
+        msp.add_line((2, 3), (3, 3), dxfattribs={"invisible": 1})
+        msp.add_blockref("NOWHERE", (2, 3))
+
+    report = Report()
+    grid = load(tmp_path, draw, report)
+    # As CAD programs do: a frozen insertion hides its block, one that is only switched off does not.
+    assert occupied_at(grid, [(2.5, 1), (2.5, 2), (2.5, 3)]).tolist() == [False, True, False]
+    assert sorted(report.lines()) == ["1 INSERT entities without their block", "1 invisible entities"]
+
+
+def test_a_drawing_in_survey_coordinates_names_the_shift(tmp_path):
+    far = [(x + 3512345.0, y + 5403210.0) for x, y in ROOM]
+    with pytest.raises(UserError, match=r"single precision; move it in a yaml: pose: \[-35123\d\d, -54032\d\d, 0\]"):
+        load(tmp_path, lambda msp: room(msp, far))
+    grid = load(tmp_path, lambda msp: room(msp, far), pose=(-3512345.0, -5403210.0, 0.0))
+    assert occupied_at(grid, [(0, 2), (6, 2)]).all() and free_at(grid, (3, 2)) == [True]
 
 
 def test_free_is_the_inside_without_the_hollow_of_walls(tmp_path):

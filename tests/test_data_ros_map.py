@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from dsom_jax.data.log import Report
 from dsom_jax.data.pgm import decode_pgm, encode_pgm
 from dsom_jax.data.ros_map import MapInfo, load_ros_map, occupancy_percent, read_map_info, save_ros_map
 from dsom_jax.errors import UserError
@@ -65,6 +66,25 @@ def test_what_unknown_cells_are(tmp_path: Path, unknown: str, occupied: bool, fr
     grid = load_ros_map(write(tmp_path), unknown=unknown)
     assert bool(grid.occupied[1, 1]) is occupied
     assert bool(grid.free[1, 1]) is free
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [({"free_thresh": "0.25"}, True), ({}, False), ({"free_thresh": "0.25", "mode": "scale"}, False),
+     ({"free_thresh": "0.25", "negate": "1"}, False)],
+)  # fmt: skip
+def test_map_savers_grey_that_is_free_is_told(tmp_path: Path, changes: dict, told: bool) -> None:
+    """nav2's map_saver writes unknown as 205, which its own default threshold takes for free."""
+    report = Report()
+    grid = load_ros_map(write(tmp_path, **changes), report=report)
+    assert any("1 pixels of grey 205" in line and "0.196" in line for line in report.lines()) is told
+    # The semantics stay nav2's, whatever is told.
+    assert "negate" in changes or bool(grid.free[1, 1]) is ("free_thresh" in changes)
+
+
+def test_a_map_in_survey_coordinates_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"map.yaml: lies at \(3500000, 5400000\) m .* single precision"):
+        load_ros_map(write(tmp_path, origin="[3.5e6, 5.4e6, 0]"))
 
 
 def test_unknown_must_be_named(tmp_path: Path) -> None:

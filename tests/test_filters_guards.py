@@ -14,7 +14,7 @@ import pytest
 from dsom_jax import pose_grid as pg
 from dsom_jax.filters.adam import AdamMCL
 from dsom_jax.filters.adam_robust import RobustConfig
-from dsom_jax.filters.updates import FilterConfig
+from dsom_jax.filters.updates import FilterConfig, masked_ancestors
 from dsom_jax.occupancy import is_free
 from dsom_jax.sensor import ScoreModel
 from dsom_jax.types import Inputs
@@ -126,6 +126,17 @@ def test_a_pose_drawn_where_nobody_can_stand_weighs_nothing(world, spot, episode
     np.testing.assert_allclose(weights[free], 1 / free.sum(), rtol=1e-3)
     state, info = step(f, jax.random.key(2), state, at(episode, 1))
     assert_sound(state, info, 200)
+
+
+@pytest.mark.parametrize("method", ["systematic", "multinomial"])
+def test_members_whose_weights_all_vanish_are_drawn_evenly(method):
+    """High powers of Eq 15 underflow for all of H while others, outside of it, still have weight."""
+    member = jnp.arange(6) % 3 == 1
+    weights = jnp.where(member, 0.0, 0.25)
+    drawn = np.concatenate(
+        [masked_ancestors(key, weights, member, method) for key in jax.random.split(jax.random.key(0), 50)]
+    )
+    assert set(drawn.tolist()) == {1, 4} and abs((drawn == 1).mean() - 0.5) < 0.12
 
 
 def test_no_particles_are_refused():

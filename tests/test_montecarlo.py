@@ -112,6 +112,12 @@ def test_against_a_plain_loop():
     np.testing.assert_allclose(result.state[1], state, atol=1e-5)
 
 
+def test_an_increment_that_is_no_number_moves_no_particle():
+    drive, keys = episode(), montecarlo.run_keys(0, 0, 2)
+    spoilt, still = (drive._replace(odometry=drive.odometry.at[2].set(row)) for row in ([0.1, jnp.nan, 0.2], 0.0))
+    same(montecarlo.run(walk(), spoilt, keys), montecarlo.run(walk(), still, keys))
+
+
 @pytest.mark.parametrize("runs", [1, 3])
 def test_run_r_of_a_batch_equals_the_same_run_alone_bit_for_bit(runs):
     keys = montecarlo.run_keys(0, 0, 33)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import sys
 from dataclasses import replace
@@ -9,14 +10,19 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from dsom_jax import train
 from dsom_jax.cli import parse
+from dsom_jax.data.suite import Suite
+from dsom_jax.episode import Episode
 from dsom_jax.errors import UserError
 from dsom_jax.filters.methods import DRAWN
 from dsom_jax.lidar import LidarConfig
-from dsom_jax.protocol import adapting, running
+from dsom_jax.occupancy import from_cells
+from dsom_jax.protocol import adapting, clips, running
 from dsom_jax.protocol.plan import Plan, Variant, read_plan, variants
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -72,12 +78,65 @@ def test_a_map_replaces_what_it_names():
     assert plan.on("b")[0].logs == ("all.log",) and plan.on("b")[0].adapt == plan.adapt
 
 
+def made_suite(grid, mount=(0.0, 0.0, 0.0), far=1.0) -> Suite:
+    """Two clips of three scans."""
+    still = jnp.zeros((3, 3))
+    clip = Episode(jnp.full((3, 4), far), still, still, jnp.zeros(3, bool), jnp.arange(3.0))
+    return Suite("made, m", LidarConfig(4, mount=mount), (), (("m", grid, clip),) * 2)
+
+
+def test_results_are_kept_only_of_the_same_map_logs_and_network(tmp_path):
+    plan, variant, start = Plan(), Variant("adam_dsom", True, 0.6), tmp_path / "net"
+    start.mkdir()
+    (start / "provenance.json").write_text("{}")
+    grid = from_cells(np.eye(8, dtype=bool), ~np.eye(8, dtype=bool), resolution=0.1)
+    first = running.identity(variant, plan, made_suite(grid), start)
+    (tmp_path / f"{variant.stem}.json").write_text(json.dumps(first))
+    assert not running.is_done(variant, first, tmp_path, tmp_path)
+    (tmp_path / f"{variant.stem}.npz").touch()
+    assert running.is_done(variant, first, tmp_path, tmp_path)
+    again = running.identity(variant, plan, made_suite(grid), start)
+    moved = from_cells(grid.occupied, grid.free, resolution=0.1, origin=(0.01, 0.0, 0.0))
+    changed = [
+        running.identity(variant, plan, made_suite(moved), start),
+        running.identity(variant, plan, made_suite(grid, far=2.0), start),
+        running.identity(variant, replace(plan, seed=1), made_suite(grid), start),
+    ]
+    (start / "provenance.json").write_text("{ }")
+    changed.append(running.identity(variant, plan, made_suite(grid), start))
+    assert again == first and not any(running.is_done(variant, c, tmp_path, tmp_path) for c in changed)
+
+
+def test_mounts_that_differ_by_rounding_are_one_lidar():
+    """Two cuts of a log whose poses have six decimals."""
+    a, b = (LidarConfig(4, mount=(x, 0.0, 0.0)) for x in (0.19999992857, 0.19999986657))
+    assert a != b and clips.rounded(a) == clips.rounded(b) != clips.rounded(LidarConfig(4, mount=(0.21, 0.0, 0.0)))
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ("map.yaml", "give fields, at least yaml"),
+        ("{image_file: a.png}", "at least yaml, image or drawing"),
+        ("{yaml: a.yaml, box: [0, 0, 1, 1]}", "box needs a drawing"),
+        ("{drawing: a.dxf, units: miles, box: [0, 0, 1, 1]}", "units out of mm"),
+        ("{drawing: a.dxf, box: [0, 0, 1]}", "box = "),
+    ],
+)
+def test_maps_that_are_described_wrongly(tmp_path, fields, message):
+    config = tmp_path / "c.yaml"
+    config.write_text(f"maps: {{hall: {fields}}}\nlogs: [a.log]\nmethods: [mcl]\nt_cuts: [0.6]\n")
+    with pytest.raises(UserError, match=message) as error:
+        read_plan(config, {})
+    assert "hall" in str(error.value)
+
+
 def test_training_is_called_with_words_that_it_knows(monkeypatch, tmp_path):
     called: list[list[str]] = []
     monkeypatch.setattr(adapting.subprocess, "run", lambda words: called.append(words) or SimpleNamespace(returncode=0))
     start, lidar = ROOT / "checkpoints" / "dsom", LidarConfig(180, -math.pi / 2, math.pi / 180)
     plan = Plan(adapt_minutes=12.0, adapt={"learning_rate": 1e-4, "scan": {"removed": [0, 9]}})
-    folder = adapting.adapt(plan, tmp_path / "map.yaml", start, lidar, tmp_path / "net")
+    folder = adapting.adapt(plan, tmp_path / "map.yaml", "a", start, lidar, tmp_path / "net")
     monkeypatch.setattr(sys, "argv", called[0][2:])
     arguments = parse(train.Arguments, "python -m dsom_jax.train")
     assert folder == arguments.out == tmp_path / "net" and arguments.init == start
@@ -87,7 +146,10 @@ def test_training_is_called_with_words_that_it_knows(monkeypatch, tmp_path):
     assert (config.learning_rate, config.scan.removed, config.maps_share) == (1e-4, (0, 9), 1.0)
     # It continues what is shipped, and takes its scans from the lidar.
     assert train.load_init(start, config) is not None and config.model.misfit(lidar) is None
-    assert adapting.adapt(replace(plan, adapt_minutes=0.0), Path("m"), start, lidar, tmp_path) == start
+    assert adapting.adapt(replace(plan, adapt_minutes=0.0), Path("m"), "a", start, lidar, tmp_path) == start
     monkeypatch.setattr(adapting.subprocess, "run", lambda words: SimpleNamespace(returncode=2))
     with pytest.raises(UserError, match=r"training on map.yaml failed"):
-        adapting.adapt(plan, tmp_path / "map.yaml", start, lidar, tmp_path / "net")
+        adapting.adapt(plan, tmp_path / "map.yaml", "a", start, lidar, tmp_path / "net")
+    (tmp_path / "net").mkdir()
+    with pytest.raises(UserError, match="another map"):
+        adapting.adapt(plan, tmp_path / "map.yaml", "b", start, lidar, tmp_path / "net")

@@ -57,6 +57,12 @@ def test_a_run_resumed_before_its_length_is_known_gets_all_of_its_minutes(run):
     assert run.total == 20 + 5 + CALIBRATION_STEPS + int(60 * 0.95)
 
 
+def test_a_run_resumed_before_its_length_is_known_takes_the_steps_that_are_asked_for(tmp_path):
+    create(Run(tmp_path, TrainConfig(), (), None))
+    assert open_run(Arguments(out=tmp_path, resume=True, steps=7))[0].total == 7
+    assert open_run(Arguments(out=tmp_path, resume=True))[0].total is None
+
+
 def test_a_checkpoint_is_not_written_over_in_place(tmp_path, monkeypatch):
     tags = []
     monkeypatch.setattr(checkpoint, "save_state", lambda path, state: path.mkdir(exist_ok=True))

@@ -15,7 +15,8 @@ from dsom_jax.training.loop import StageConfig, TrainConfig, init_state, make_ba
 from dsom_jax.training.sharding import data_mesh, replicate, spread
 
 SCAN = ScanConfig(beams=36, reach_min=5.0, obstacles=(0, 0))
-ROOM = jnp.zeros((24, 24), bool).at[::23].set(True).at[:, ::23].set(True).at[6:9, 5].set(True)
+ROOM = jnp.zeros((48, 48), bool).at[::47].set(True).at[:, ::47].set(True).at[12:18, 10].set(True)
+"""At half of the network's cells, so that batches carry the views of the finer map."""
 
 
 def losses(worlds: int, scans: int, steps: int = 6) -> list[float]:
@@ -23,10 +24,11 @@ def losses(worlds: int, scans: int, steps: int = 6) -> list[float]:
     model = DSOMConfig(width=4, headings=8, panorama=True, fov_min=SCAN.fov_min, reach_min=SCAN.reach_min)
     stage = StageConfig(16, worlds, scans)
     config = TrainConfig(model=model, scan=SCAN, early=stage, late=stage, warmup=5)
-    mesh, batches = data_mesh(), make_batches(config, [from_cells(ROOM, resolution=model.resolution)])
+    mesh, batches = data_mesh(), make_batches(config, [from_cells(ROOM, resolution=model.resolution / 2)])
     state, step, found = replicate(init_state(config), mesh), make_step(config), []
     for number in range(steps):
         batch = spread(batches(number, 100), mesh)
+        assert batch.views is not None
         if mesh.size > 1:
             shares = {shard.data.shape for shard in batch.poses.addressable_shards}
             assert shares == {(worlds // 2, scans, 3) if worlds % 2 == 0 else (worlds, scans // 2, 3)}, shares

@@ -45,6 +45,7 @@ PROPOSALS = {
     "hybrid": ("hybrid", "#b5179e"),
 }
 """Proposals that are compared: what figures call them, and their colours."""
+NETWORKS = ("dsom", "pf_net", "pfrnn")
 DIGITS = 6
 """Significant digits that are kept of every number."""
 
@@ -61,12 +62,12 @@ class Lab:
     Attributes:
         seed: of all randomness.
         sources: proposals that were made, by the name of the map.
-        scenes: what a proposal makes of a sequence, by its name and the sequence (:mod:`retention`).
+        scenes: what PM is on a sequence, by proposal, exponent and sequence (:mod:`retention`).
     """
 
     seed: int = 0
     sources: dict[str, dict[str, Proposal]] = field(default_factory=dict)
-    scenes: dict[tuple[str, int], Any] = field(default_factory=dict)
+    scenes: dict[tuple[str, float, int], Any] = field(default_factory=dict)
 
     @cached_property
     def suite(self) -> Suite:
@@ -77,12 +78,18 @@ class Lab:
     def networks(self) -> dict[str, Any]:
         """The shipped networks by kind."""
         found = {}
-        for kind in ("dsom", "pf_net", "pfrnn"):
+        for kind in NETWORKS:
             folder = checkpoint.shipped(kind)
             if folder is None:
                 raise UserError(f"checkpoints/{kind.replace('_', '-')}: not there; run this from the repository")
             found[kind] = checkpoint.load(folder, self.suite.lidar, kind=kind)
         return found
+
+    @cached_property
+    def origins(self) -> dict[str, str]:
+        """Digests of the shipped networks: results of others are not of this repository."""
+        folders = {kind: checkpoint.shipped(kind) for kind in NETWORKS}
+        return {kind: checkpoint.digest(folder) for kind, folder in folders.items() if folder}
 
     def keys(self, runs: int) -> list[Key]:
         """Keys of the runs of each sequence: the same for all methods and settings."""
@@ -172,6 +179,7 @@ def measured(job: Job, lab: Lab, config: Any) -> dict[str, Any]:
     made = {
         "config": asdict(config),
         "seed": lab.seed,
+        "networks": lab.origins,
         "commit": commit(),
         "machine": machine(),
         "wall_s": time.perf_counter() - wall,

@@ -16,7 +16,7 @@ from scenes import WORLD, Change, Condition, building, take
 from symmetric import images, off_middle, symmetric
 from tables import bounds, markdown, number, percent
 
-from dsom_jax import metrics, plotting
+from dsom_jax import plotting
 from dsom_jax import pose_grid as pg
 from dsom_jax.filters.methods import Settings, make_proposal
 from dsom_jax.geometry import transform_points
@@ -142,7 +142,7 @@ def told(parts: list[tuple[np.ndarray, np.ndarray]], order: int) -> dict[str, An
         "peaks_mean": float(peaks.mean()),
         "peaks_ci95": clustered_bootstrap(peaks, world),
         "all_found": float(all_found.mean()),
-        "all_found_ci95": metrics.wilson(float(all_found.mean()), len(all_found)),
+        "all_found_ci95": clustered_bootstrap(all_found, world),
         "truth": float(mass[:, 0].mean()),
         "right": float(mass.sum(-1).mean()),
         "least": float(mass.min(-1).mean()),

@@ -61,13 +61,14 @@ def follow(
     name: str, config: Config, lab: Lab, number: int, where: str, grid: OccupancyGrid, episode: Episode
 ) -> list[Part]:
     """The runs of one filter on one sequence, by T_cut."""
-    filter, keys = lab.build(name, where, grid, episode, config.particles), lab.keys(config.runs)[number]
+    filter: Any = lab.build(name, where, grid, episode, config.particles)
+    keys = lab.keys(config.runs)[number]
     if COMBINATIONS[name][0] == "adam":
         results = run_all(filter, other_t_cut, config.t_cuts, episode, keys)
     else:
         results = [run(filter, episode, keys)]
-    # Alg 1 and AdaM robust draw from the same proposals.
-    which = COMBINATIONS[name][1], number
+    # Alg 1 and AdaM robust draw from the same proposals, but for the exponent of a network's PM.
+    which = COMBINATIONS[name][1], getattr(filter.proposal, "sharpness", 1.0), number
     scene = lab.scenes[which] = lab.scenes.get(which) or scene_of(lab, filter, where, grid, episode)
     return [Part(name, number, episode, result, scene) for result in results]
 

@@ -80,6 +80,8 @@ def check(args: Args) -> None:
         raise UserError(f"--only {unknown[0]}: no such piece; choose from {', '.join(p.name for p in PIECES)}")
     if not 1 <= args.runs <= 10_000:
         raise UserError(f"--runs {args.runs}: give at least 1 and at most 10000")
+    if not 0 <= args.seed < 2**31:
+        raise UserError(f"--seed {args.seed}: give 0 or more, and less than 2^31")
 
 
 def run_piece(piece: Piece, lab: Lab, args: Args, folder: Path) -> list[str]:
@@ -91,8 +93,9 @@ def run_piece(piece: Piece, lab: Lab, args: Args, folder: Path) -> list[str]:
             continue
         if path.exists() and not args.force:
             made = read(path)["made"]
-            same = (made["config"], made["seed"]) == (report.plain(asdict(config)), lab.seed)
-            print(f"{full}: kept" + ("" if same else ", made with other settings (--force)"), flush=True)
+            wanted = report.plain(asdict(config)), lab.seed, lab.origins
+            same = (made["config"], made["seed"], made.get("networks")) == wanted
+            print(f"{full}: kept" + ("" if same else ", made with other settings or networks (--force)"), flush=True)
         elif not run_job(full, path, job, lab, config):
             failed.append(full)
     return failed

@@ -6,6 +6,7 @@ weights. Both are written under other names and renamed, the json last, so that 
 
 from __future__ import annotations
 
+import hashlib
 import json
 import logging
 import shutil
@@ -100,6 +101,14 @@ def load_provenance(directory: str | Path, kind: str = "dsom") -> dict[str, Any]
     if held != kind:
         raise UserError(f"{path}: field kind is {held}, but a {kind} is needed; give the folder of one")
     return record
+
+
+def digest(directory: str | Path) -> str:
+    """Twelve hexadecimal digits of the provenance of a checkpoint, which no other training shares."""
+    path = Path(directory) / PROVENANCE
+    if not path.is_file():
+        raise UserError(f"{path}: no such file; give the folder of a checkpoint")
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:12]
 
 
 def tag_of(directory: str | Path) -> str | None:

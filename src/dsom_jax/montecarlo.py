@@ -80,14 +80,16 @@ def signature(filter: Filter, episode: Episode) -> Any:
 def simulate(filter: Filter, inputs: Inputs, keep: Array | None, keys: Key) -> tuple[Any, Any, Any]:
     """The pure computation of one device: info (R, T, ...), state (R, ...), kept (1, K, ...).
 
-    inputs (T, ...), keys (R,); ``keep`` (K,) are updates, or None.
+    inputs (T, ...), keys (R,); ``keep`` (K,) are updates, or None. To particles, an increment of the odometry that is
+    not finite is none: one such would leave them without a pose for good.
     """
 
     def update(carry: tuple[Any, Any], now: Inputs) -> tuple[Any, Any]:
         memory, states = carry
         prepared, memory = recall(filter, memory, now)
         step_keys = _fold(keys, now.index + 1)
-        states, info = jax.vmap(lambda key, state: filter.step(key, state, now, prepared))(step_keys, states)
+        told = now._replace(odometry=jnp.where(jnp.isfinite(now.odometry).all(), now.odometry, 0.0))
+        states, info = jax.vmap(lambda key, state: filter.step(key, state, told, prepared))(step_keys, states)
         return (memory, states), (info, None if keep is None else jax.tree.map(lambda leaf: leaf[0], states))
 
     memory = filter.begin() if isinstance(filter, Remembering) else None

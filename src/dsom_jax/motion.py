@@ -22,8 +22,8 @@ class OdometryMotion:
         alpha2: rotation noise from translation, rad^2 / m^2.
         alpha3: translation noise from translation.
         alpha4: translation noise from rotation, m^2 / rad^2.
-        min_xy, min_theta: standard deviations (m, rad) added however little the robot moved; positive, so that
-            particles never coincide and densities stay finite.
+        min_xy, min_theta: standard deviations (m, rad) added however little the robot moved; a filter needs them
+            positive, so that particles never coincide and densities stay finite; 0 simulates an exact drive.
         slip: probability that the reported translation is wrong altogether, and its true share uniform in [-1.2, 1.2]:
             wheels that slip or are blocked, encoders that do not tell backward from forward.
         tail: probability that the noise has ``tail_scale`` times its standard deviation: tyres on another floor.

@@ -132,7 +132,8 @@ def reopen(
 ) -> R:
     """The run that the ``run.json`` at ``path`` describes; ``read_config`` makes its configuration of what it holds.
 
-    UserError if it is another than ``maps`` and ``steps``, where given, ask for.
+    UserError if it is another than ``maps`` and ``steps``, where given, ask for; ``steps`` are those of a run that was
+    stopped before it had counted its own.
     """
     try:
         record = json.loads(path.read_text())
@@ -145,6 +146,7 @@ def reopen(
         raise UserError(f"--maps: the run in {path} has {', '.join(run.maps) or 'none'}; resume without --maps")
     if steps is not None and run.total is not None and steps != run.total:
         raise UserError(f"--steps {steps}: the run in {path} has {run.total}; resume without --steps")
+    run.total = run.total or steps
     return run
 
 

@@ -141,12 +141,25 @@ def _assemble(
     keep = majority_beams([m.ranges for m in scans], report, path)
     scans = [m for m, kept in zip(scans, keep, strict=True) if kept]
     stamps = np.array([stamp_of(m) for m in scans])
-    lidar = _lidar(path, scans[0], tree, base, range_max, report)
-    ranges = limit_ranges(np.stack([m.ranges for m in scans]), lidar.range_min, lidar.range_max)
+    ranges = np.stack([m.ranges for m in scans])
+    reach = range_max or _reach(scans[0], ranges, report)
+    lidar = _lidar(path, scans[0], tree, base, reach, report)
+    ranges = limit_ranges(ranges, lidar.range_min, lidar.range_max)
     return tidy(RawLog(ranges, odometry_at(rows, stamps, report), stamps, lidar, None, report, path))
 
 
-def _lidar(path: Path, scan: Any, tree: TfTree, base: str, range_max: float | None, report: Report) -> LidarConfig:
+def _reach(scan: Any, ranges: np.ndarray, report: Report) -> float:
+    """range_max as the driver says; where it says infinity or nothing, a centimetre more than the longest reading."""
+    told = float(scan.range_max)
+    found = ranges[np.isfinite(ranges) & (ranges > scan.range_min)]
+    if (np.isfinite(told) and told > scan.range_min) or not len(found):
+        return told
+    reach = float(found.max()) + 0.01
+    report.add(f"range_max of {told:g} m in the scans: {reach:.2f} m is taken, after the longest reading")
+    return reach
+
+
+def _lidar(path: Path, scan: Any, tree: TfTree, base: str, range_max: float, report: Report) -> LidarConfig:
     """Geometry that the scans and /tf tell."""
     mount = tree.mount(base, scan.header.frame_id)
     if mount is None:
@@ -160,7 +173,7 @@ def _lidar(path: Path, scan: Any, tree: TfTree, base: str, range_max: float | No
             angle_min=float(scan.angle_min),
             angle_increment=float(scan.angle_increment),
             range_min=float(scan.range_min),
-            range_max=float(range_max or scan.range_max),
+            range_max=float(range_max),
             mount=(x, y, yaw),
             upside_down=upside_down,
         )

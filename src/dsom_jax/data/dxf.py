@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dsom_jax.data import se2
-from dsom_jax.data.files import read_bytes
+from dsom_jax.data.files import check_near, read_bytes
 from dsom_jax.data.log import Report
 from dsom_jax.data.rasterize import enclosed, reachable, touched_cells
 from dsom_jax.errors import UserError
@@ -169,7 +169,14 @@ def _visible(document: Any, entities: Any, drawing: Drawing, report: Report, lay
         if _matches(name, drawing.exclude):
             continue
         kind = entity.dxftype()
-        if kind == "INSERT":
+        if entity.dxf.get("invisible", 0):
+            report.add("invisible entities")
+        elif kind == "INSERT":
+            if entity.block() is None:
+                report.add("INSERT entities without their block")
+                continue
+            if not drawing.layers and _is_frozen(document, name):
+                continue
             for single in entity.multi_insert() if entity.mcount > 1 else [entity]:
                 yield from _visible(document, single.virtual_entities(), drawing, report, name)
         elif not (_matches(name, drawing.layers) if drawing.layers else _is_on(document, name)):
@@ -195,6 +202,11 @@ def _is_on(document: Any, layer: str) -> bool:
         return True
     entry = document.layers.get(layer)
     return entry.is_on() and not entry.is_frozen()
+
+
+def _is_frozen(document: Any, layer: str) -> bool:
+    """Whether a layer is frozen: what is inserted on it is hidden whole, on whatever layers its parts are."""
+    return layer in document.layers and document.layers.get(layer).is_frozen()
 
 
 def _extent(path: Path, segments: np.ndarray, resolution: float) -> tuple[np.ndarray, tuple[int, int]]:
@@ -241,6 +253,7 @@ def _grid(
         rows, columns = _cells(box + np.array([[-margin], [margin]]), free.shape)
         corner = corner + drawing.resolution * np.array([columns.start, rows.start])
     x, y, yaw = se2.compose(np.array(drawing.pose, float), np.array([*corner, 0.0])).tolist()
+    check_near(path, (x, y), f"move it in a yaml: pose: [{-corner[0]:.0f}, {-corner[1]:.0f}, 0]")
     cells = jnp.asarray(occupied[rows, columns]), jnp.asarray(free[rows, columns])
     return from_cells(*cells, resolution=drawing.resolution, origin=(x, y, yaw))
 

@@ -49,3 +49,14 @@ def read_yaml(path: str | Path, what: str) -> dict[str, Any]:
     if not isinstance(document, Mapping):
         raise UserError(f"{path}: holds no fields; the {what} must be a list of 'field: value' lines")
     return {str(key): value for key, value in document.items()}
+
+
+FAR = 1e5
+"""Metres from the origin of the map frame where float32 still tells poses a centimetre apart."""
+
+
+def check_near(path: str | Path, position: tuple[float, float], fix: str) -> None:
+    """UserError for a map that lies so far from the origin of its frame that single precision would blur poses."""
+    if max(map(abs, position)) > FAR:
+        x, y = position
+        raise UserError(f"{path}: lies at ({x:.0f}, {y:.0f}) m in the map frame, too far for single precision; {fix}")

@@ -158,7 +158,8 @@ def check_lidar(log: RawLog, lidar: LidarConfig | None = None) -> None:
     """Stop with a clear error where no filter could work: no scans, wrong beam count, no usable range at all."""
     lidar = lidar or log.lidar
     if len(log) == 0:
-        raise UserError(f"{log.path}: holds no scan; give a log with laser scans and odometry")
+        why = f" that can be used ({'; '.join(log.report.lines())})" if log.report.counts else ""
+        raise UserError(f"{log.path}: holds no scan{why}; give a log with laser scans and odometry of one clock")
     if log.ranges.shape[1] != lidar.beams:
         raise UserError(
             f"{log.path}: wrong lidar for the log: its scans have {log.ranges.shape[1]} beams, "

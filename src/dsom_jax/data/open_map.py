@@ -17,14 +17,14 @@ from dsom_jax.training.options import override
 def load_map(path: str | Path, report: Report | None = None) -> OccupancyGrid:
     """A ROS map_server yaml, a DXF drawing, or a yaml with ``drawing: FILE.dxf`` and fields of :class:`Drawing`.
 
-    A drawing that is named without a yaml is read with the defaults. ``report`` takes what was left out of it.
+    A drawing that is named without a yaml is read with the defaults. ``report`` takes what was left out or is odd.
     """
     path = Path(path)
     if path.suffix.lower() in (".dxf", ".dwg"):
         return load_drawing(path, report=report)
     fields = read_yaml(path, "map yaml")
     if "drawing" not in fields:
-        return load_ros_map(path)
+        return load_ros_map(path, report=report)
     plan = fields.pop("drawing")
     if not isinstance(plan, str):
         raise UserError(f"{path}: drawing = {plan!r}: must be the name of a DXF file")

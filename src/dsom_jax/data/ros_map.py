@@ -17,7 +17,8 @@ import cv2
 import numpy as np
 
 from dsom_jax.atomic import write_atomic
-from dsom_jax.data.files import read_bytes, read_yaml
+from dsom_jax.data.files import check_near, read_bytes, read_yaml
+from dsom_jax.data.log import Report
 from dsom_jax.data.pgm import decode_pgm, encode_pgm
 from dsom_jax.errors import UserError
 from dsom_jax.occupancy import OccupancyGrid, from_cells
@@ -27,6 +28,8 @@ Unknown = Literal["blocked-for-robot", "opaque", "free"]
 
 MODES = ("trinary", "scale", "raw")
 UNKNOWN = -1
+GREY = 205
+"""Of unknown pixels, as map_saver writes them: just above 0.196 in occupancy."""
 
 
 @dataclass(frozen=True)
@@ -52,12 +55,20 @@ class MapInfo:
     mode: str
 
 
-def load_ros_map(path: str | Path, unknown: Unknown = "blocked-for-robot") -> OccupancyGrid:
-    """Grid (H, W) of a map_server yaml; ``unknown`` says what unknown cells are to robot and rays."""
+def load_ros_map(
+    path: str | Path, unknown: Unknown = "blocked-for-robot", report: Report | None = None
+) -> OccupancyGrid:
+    """Grid (H, W) of a map_server yaml; ``unknown`` says what unknown cells are to robot and rays.
+
+    ``report`` takes what is odd about it.
+    """
     if unknown not in get_args(Unknown):
         raise UserError(f"unknown = {unknown!r}: choose one of {', '.join(get_args(Unknown))}")
     info = read_map_info(path)
-    percent = occupancy_percent(*decode_image(info.image), info)[::-1]
+    brightness, opaque = decode_image(info.image)
+    if report is not None:
+        report_grey(brightness, info, report)
+    percent = occupancy_percent(brightness, opaque, info)[::-1]
     occupied, free = percent == 100, percent == 0
     blank = ~(occupied | free)
     if unknown == "opaque":
@@ -114,6 +125,7 @@ def _origin(path: str | Path, fields: dict[str, Any]) -> tuple[float, float, flo
         raise UserError(f"{path}: origin = {value!r}: must be three numbers [x, y, yaw]") from None
     if not all(map(math.isfinite, (x, y, yaw))):
         raise UserError(f"{path}: origin = {value!r}: must be finite")
+    check_near(path, (x, y), "take the same offset from the origin here and from the reference")
     return x, y, yaw
 
 
@@ -167,11 +179,24 @@ def occupancy_percent(brightness: np.ndarray, opaque: np.ndarray | None, info: M
     return percent if opaque is None else np.where(opaque, percent, UNKNOWN)
 
 
+def report_grey(brightness: np.ndarray, info: MapInfo, report: Report) -> None:
+    """Note map_saver's grey for unknown where the thresholds make it free, as nav2's default of 0.25 does."""
+    grey = np.isclose(brightness, GREY / 255)
+    only = np.isin(np.rint(brightness * 255), (0, GREY, 254, 255)).all()
+    taken_for_free = not info.negate and info.mode == "trinary" and info.free_thresh >= 1 - GREY / 255 - 1e-9
+    if only and taken_for_free and grey.any() and not grey.all():
+        report.add(
+            f"pixels of grey {GREY}, which map_saver writes for unknown, are free cells by free_thresh = "
+            f"{info.free_thresh:g}; if they are unknown, set free_thresh: 0.196 and load it again",
+            count=int(grey.sum()),
+        )
+
+
 def save_ros_map(grid: OccupancyGrid, path: str | Path) -> None:
     """Write ``path`` (yaml) and the pgm of the same name beside it, trinary, as map_saver does."""
     path = Path(path)
     image = path.with_suffix(".pgm")
-    pixels = np.full(grid.shape, 205, np.uint8)
+    pixels = np.full(grid.shape, GREY, np.uint8)
     pixels[np.asarray(grid.free)] = 254
     pixels[np.asarray(grid.occupied)] = 0
     origin = ", ".join(repr(float(v)) for v in np.asarray(grid.origin))

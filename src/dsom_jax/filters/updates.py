@@ -90,7 +90,9 @@ def start(key: Key, world: World, config: FilterConfig) -> ParticleState:
 
 def masked_ancestors(key: Key, normalised: Array, member: Array, method: Resampling) -> Array:
     """(N,) ancestors drawn by w_norm among ``member`` (N,) only, one stratum for each member's slot."""
-    cumulative = jnp.cumsum(jnp.where(member, normalised, 0.0))
+    mass = jnp.where(member, normalised, 0.0)
+    # High powers of small weights vanish; members whose weights all do are equally good.
+    cumulative = jnp.cumsum(jnp.where(mass.sum() > 0, mass, member))
     if method == "multinomial":
         return pick(cumulative, jax.random.uniform(key, member.shape))
     count = jnp.maximum(member.sum(), 1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import subprocess
 import sys
@@ -30,10 +31,19 @@ def settings(start: Path, lidar: LidarConfig, changes: dict[str, Any]) -> dict[s
     return given
 
 
-def adapt(plan: Plan, map_yaml: Path, start: Path, lidar: LidarConfig, folder: Path) -> Path:
+def check_begun(folder: Path, made_of: dict[str, str]) -> None:
+    """Note what a network is made of; UserError if the one in ``folder`` is of another map or start."""
+    record = folder.with_suffix(".json")
+    if folder.exists() and record.is_file() and json.loads(record.read_text()) != made_of:
+        raise UserError(f"{folder}: was trained on another map, or from another network; delete it to train again")
+    write_atomic(record, json.dumps(made_of).encode())
+
+
+def adapt(plan: Plan, map_yaml: Path, map_digest: str, start: Path, lidar: LidarConfig, folder: Path) -> Path:
     """Folder of the network adapted to a map; a training that was killed goes on where it was."""
     if not plan.adapt_minutes > 0:
         return start
+    check_begun(folder, {"map": map_digest, "start": checkpoint.digest(start)})
     config = folder.with_suffix(".yaml")
     write_atomic(config, yaml.safe_dump(settings(start, lidar, plan.adapt)).encode())
     length = ("--steps", plan.adapt_steps) if plan.adapt_steps else ("--minutes", plan.adapt_minutes)

@@ -13,9 +13,10 @@ from dsom_jax.errors import UserError
 from dsom_jax.filters.methods import network_of
 from dsom_jax.protocol.adapting import adapt
 from dsom_jax.protocol.clips import choose
+from dsom_jax.protocol.digests import map_digest
 from dsom_jax.protocol.plan import Plan, Variant, map_file, read_logs, read_plan, variants
 from dsom_jax.protocol.reporting import write_report
-from dsom_jax.protocol.running import Builder, is_done, run_variant
+from dsom_jax.protocol.running import Builder, identity, is_done, run_variant
 
 
 @dataclass(frozen=True)
@@ -74,19 +75,22 @@ def run_map(plan: Plan, suite: Suite, map_yaml: Path, start: Path | None, name: 
     @cache
     def adapted() -> Path | None:
         length = f"{plan.adapt_steps}-steps" if plan.adapt_steps else f"{plan.adapt_minutes:g}-min"
-        return start and adapt(plan, map_yaml, start, suite.lidar, work / "networks" / f"{name}-{length}")
+        folder, grid = work / "networks" / f"{name}-{length}", suite.episodes[0][1]
+        return start and adapt(plan, map_yaml, map_digest(grid), start, suite.lidar, folder)
+
+    def begun(variant: Variant) -> Path | None:
+        kind = network_of(variant.method)
+        return start if kind == "dsom" else checkpoint.shipped(kind) if kind else None
 
     def network(variant: Variant) -> Path | None:
-        kind = network_of(variant.method)
-        if kind != "dsom":
-            return checkpoint.shipped(kind) if kind else None
-        return start if variant.shipped else adapted()
+        return begun(variant) if variant.shipped or network_of(variant.method) != "dsom" else adapted()
 
     folders = report.output_folder(out / name), report.output_folder(work / name)
     build = Builder(plan, suite, network)
     for variant in variants(plan):
-        if is_done(variant, plan, suite, *folders):
+        made_of = identity(variant, plan, suite, begun(variant))
+        if is_done(variant, made_of, *folders):
             print(f"{name}, {variant.stem}: kept", flush=True)
             continue
-        run_variant(variant, plan, suite, build, *folders)
+        run_variant(variant, plan, suite, build, made_of, *folders)
         print(f"{name}, {variant.stem}: done", flush=True)

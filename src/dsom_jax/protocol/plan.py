@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -116,7 +116,8 @@ def read_plan(config: Path, changes: dict[str, Any]) -> Plan:
     unknown += [name for name in plan.shown if name not in plan.methods]
     if unknown or not (plan.maps and plan.methods and plan.t_cuts):
         raise UserError(f"{config}: needs maps, t_cuts, and known methods; got {unknown}")
-    for name in plan.maps:
+    for name, fields in plan.maps.items():
+        check_map(config, name, fields)
         one = plan.on(name)[0]
         if not one.logs or one.map_kind not in KINDS:
             raise UserError(f"{config}: {name} needs logs, and map_kind scanned or drawn")
@@ -125,6 +126,19 @@ def read_plan(config: Path, changes: dict[str, Any]) -> Plan:
     if not (plan.runs >= 1 and plan.particles >= 1 and all(0 < cut < 1 for cut in plan.t_cuts)):
         raise UserError(f"{config}: give runs and particles of at least 1 and t_cuts between 0 and 1")
     return plan
+
+
+def check_map(config: Path, name: str, fields: Any) -> None:
+    """UserError unless the map called ``name`` is described by fields that :func:`map_file` can use."""
+    if not isinstance(fields, Mapping) or not fields.keys() & {"yaml", "image", "drawing"}:
+        raise UserError(f"{config}: maps: {name} = {fields!r}: give fields, at least yaml, image or drawing: FILE")
+    if "box" not in fields:
+        return
+    if "drawing" not in fields or fields.get("units", "m") not in UNITS:
+        raise UserError(f"{config}: maps: {name}: box needs a drawing, and units out of {', '.join(UNITS)}")
+    box = fields["box"]
+    if not (isinstance(box, list) and len(box) == 4 and all(isinstance(side, int | float) for side in box)):
+        raise UserError(f"{config}: maps: {name}: box = {box!r}: give [left, top, right, bottom] in metres")
 
 
 def map_file(name: str, fields: dict[str, Any], data: Path, out: Path) -> Path:

@@ -19,6 +19,7 @@ from dsom_jax.filters.methods import COMBINATIONS, DRAWN, LEARNED, PARTS, REAL, 
 from dsom_jax.montecarlo import run_keys
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.proposals.dual_features import with_episode
+from dsom_jax.protocol.digests import clips_digest, map_digest
 from dsom_jax.protocol.plan import Plan, Variant
 from dsom_jax.run_table import RunTable
 from dsom_jax.types import Filter, Proposal
@@ -53,15 +54,17 @@ class Builder:
         return make_filter(algorithm, proposal, grid, lidar, settings)
 
 
-def run_variant(variant: Variant, plan: Plan, suite: Suite, build: Builder, out: Path, work: Path) -> None:
-    """One method on all clips: OUT/STEM.json, and every run and a picture in WORK."""
+def run_variant(
+    variant: Variant, plan: Plan, suite: Suite, build: Builder, made_of: dict[str, Any], out: Path, work: Path
+) -> None:
+    """One method on all clips: OUT/STEM.json, with what it is ``made_of``, and every run and a picture in WORK."""
     keys = [run_keys(plan.seed, number, plan.runs) for number in range(len(suite.episodes))]
     record = bench.run_method(variant.method, suite, keys, lambda _, __, grid, episode: build(variant, grid, episode))
     shared = bench.Settings(plan.runs, plan.particles, variant.t_cut or plan.t_cuts[0], plan.seed)
     entry = bench.summary(suite, {variant.method: record}, shared)["methods"][variant.method]
     draw(variant, suite, record, work)
     save_runs(work / f"{variant.stem}.npz", record, variant.stem)
-    facts = {"variant": variant.name, "t_cut": variant.t_cut, **identity(variant, plan, suite), "commit": commit()}
+    facts = {"variant": variant.name, "t_cut": variant.t_cut, **made_of, "commit": commit()}
     facts["network"] = network_facts(build.networks(variant), variant)
     report.write_json(out / f"{variant.stem}.json", facts | entry)
 
@@ -79,18 +82,20 @@ def network_facts(folder: Path | None, variant: Variant) -> dict[str, Any] | Non
     }
 
 
-def identity(variant: Variant, plan: Plan, suite: Suite) -> dict[str, Any]:
-    """What must be the same for a result to be kept."""
+def identity(variant: Variant, plan: Plan, suite: Suite, start: Path | None) -> dict[str, Any]:
+    """What must be the same for a result to be kept; ``start`` is the network that it uses, or that was trained on."""
     adapted = network_of(variant.method) == "dsom" and not variant.shipped
     training = {"adapt_minutes": plan.adapt_minutes, "adapt_steps": plan.adapt_steps, "adapt": plan.adapt}
     return (training if adapted else {}) | {
         "suite": suite.name, "map_kind": plan.map_kind, "runs": plan.runs, "particles": plan.particles,
         "clips": plan.clips, "updates": plan.updates, "seed": plan.seed, "laser_max_range": plan.laser_max_range,
+        "map_digest": map_digest(suite.episodes[0][1]), "clips_digest": clips_digest(suite),
+        "start_digest": start and checkpoint.digest(start),
     }  # fmt: skip
 
 
-def is_done(variant: Variant, plan: Plan, suite: Suite, out: Path, work: Path) -> bool:
-    """Whether the results of a variant are there and were made as the plan says."""
+def is_done(variant: Variant, made_of: dict[str, Any], out: Path, work: Path) -> bool:
+    """Whether the results of a variant are there and :func:`identity` was the same."""
     path = out / f"{variant.stem}.json"
     if not (path.is_file() and (work / f"{variant.stem}.npz").is_file()):
         return False
@@ -98,7 +103,7 @@ def is_done(variant: Variant, plan: Plan, suite: Suite, out: Path, work: Path) -
         found = json.loads(path.read_text())
     except json.JSONDecodeError as error:
         raise UserError(f"{path}: not JSON ({error}); delete it to have it made again") from None
-    return all(found.get(name) == value for name, value in identity(variant, plan, suite).items())
+    return all(found.get(name) == value for name, value in made_of.items())
 
 
 def save_runs(path: Path, record: bench.Record, name: str) -> None:

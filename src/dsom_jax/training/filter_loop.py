@@ -73,6 +73,7 @@ class FilterTrainConfig:
         checks.not_negative(self, "heading_weight particle_weight")
         checks.positive(self, "particle_xy particle_theta learning_rate clip")
         checks.count(self, "warmup seed", 0)
+        checks.within(self, "seed", 0, 2**31 - 1, "give less than 2^31")
 
     @property
     def kind(self) -> str:

@@ -34,11 +34,10 @@ def spread(batch: Batch, mesh: Mesh) -> Batch:
         return replicate(batch, mesh)
     if mesh.size == 1:
         return batch
-    maps, views = (P("data"), P("data")) if worlds % mesh.size == 0 else (P(), P(None, "data"))
+    maps, seen = (P("data"), P("data")) if worlds % mesh.size == 0 else (P(), P(None, "data"))
 
-    def place(leaf: T, spec: P) -> T:
-        return jax.device_put(leaf, NamedSharding(mesh, spec))
+    def place(tree: T, spec: P) -> T:
+        return jax.tree.map(lambda leaf: jax.device_put(leaf, NamedSharding(mesh, spec)), tree)
 
-    occupied, free = place(batch.occupied, maps), place(batch.free, maps)
-    rest = (batch.ranges, batch.conditions, batch.poses)
-    return Batch(occupied, free, *jax.tree.map(lambda leaf: place(leaf, views), rest))
+    by_world = {name: place(getattr(batch, name), maps) for name in ("occupied", "free", "views")}
+    return Batch(**by_world, **{name: place(getattr(batch, name), seen) for name in ("ranges", "conditions", "poses")})
