@@ -6,7 +6,6 @@ import re
 import sys
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -300,22 +299,6 @@ def test_a_job_that_fails_stops_no_other(tmp_path, capsys):
     # Again: what is there is kept, what failed is tried.
     assert script.run_piece(piece, lab.Lab(), script.Args(), tmp_path) == ["made.a", "made.c"]
     assert calls == ["a", "b", "c", "d", "a", "c"]
-
-
-def test_sequences_of_two_maps_come_back_in_their_order():
-    """Each once; those of one map one after the other, so that the second finds what the first has made."""
-    some = lab.Lab()
-    some.__dict__["suite"] = SimpleNamespace(episodes=[("a", 1, 10), ("b", 2, 20), ("a", 1, 30), ("b", 2, 40)])
-    made: dict[str, list[int]] = {"a": [], "b": []}
-
-    def work(number: int, where: str, grid: int, episode: int) -> tuple[int, str, int, int]:
-        made[where].append(number)
-        return number, where, grid, episode
-
-    assert some.by_sequence(work) == [(0, "a", 1, 10), (1, "b", 2, 20), (2, "a", 1, 30), (3, "b", 2, 40)]
-    assert made == {"a": [0, 2], "b": [1, 3]}
-    with pytest.raises(UserError, match="no map"):
-        some.by_sequence(lambda *_: (_ for _ in ()).throw(UserError("no map")))
 
 
 def test_a_damaged_result_is_named(tmp_path):

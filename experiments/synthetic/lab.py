@@ -11,11 +11,9 @@ import math
 import os
 import platform
 import time
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property, partial
-from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -35,7 +33,6 @@ from dsom_jax.run_folder import commit
 from dsom_jax.types import Filter, Key, Proposal
 
 C = TypeVar("C")
-S = TypeVar("S")
 T = TypeVar("T")
 SCALED = ("runs", "worlds", "repeats")
 """Fields of configurations that ``--runs`` scales, in proportion to 100."""
@@ -116,11 +113,12 @@ class Lab:
         )
 
     def by_sequence(self, work: Callable[..., T]) -> list[T]:
-        """``work(number, map's name, map, episode)`` of each sequence; maps side by side, those of one map in turn."""
-        numbered = [(number, *parts) for number, parts in enumerate(self.suite.episodes)]
-        maps = [[one for one in numbered if one[1] == where] for where in dict.fromkeys(one[1] for one in numbered)]
-        found = in_threads(lambda some: [(one[0], work(*one)) for one in some], maps)
-        return [result for _, result in sorted(chain(*found), key=lambda pair: pair[0])]
+        """``work(number, map's name, map, episode)`` of each sequence, one after the other.
+
+        Not in threads: what runs beside another computation in one process differs from it in the last bits of very
+        small probabilities, of which ``hybrid`` and Alg 1 with DSOM make other runs.
+        """
+        return [work(number, *parts) for number, parts in enumerate(self.suite.episodes)]
 
     def compare(self, name: str, settings: bench.Settings) -> tuple[dict[str, Any], bench.Record]:
         """A method on all sequences: its entry of ``bench.json``, and all of its runs."""
@@ -149,12 +147,6 @@ class Piece(NamedTuple):
     jobs: Callable[[Any], dict[str, Job]]
     figures: Callable[[Everything], dict[str, Figure]]
     section: Callable[[Everything], str]
-
-
-def in_threads(work: Callable[[S], T], items: Sequence[S]) -> list[T]:
-    """``work`` of each item, as many at a time as there are cores; compiling, and scan after scan, take one."""
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        return list(pool.map(work, items))
 
 
 def scaled(config: C, runs: int) -> C:

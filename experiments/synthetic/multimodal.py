@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from lab import PROPOSALS, Everything, Lab, Piece, compiled, in_threads
+from lab import PROPOSALS, Everything, Lab, Piece, compiled
 from matplotlib.figure import Figure
 from scenes import WORLD, Change, Condition, building, take
 from symmetric import images, off_middle, symmetric
@@ -95,7 +95,7 @@ def typical(peaks: list[int], mass: list[float]) -> dict[str, int]:
 def judge_order(order: int, config: Config, lab: Lab) -> dict[str, Any]:
     """Peaks and probability at each right pose in buildings of one order of symmetry, scans that fit the map."""
     keys = jax.random.split(jax.random.fold_in(jax.random.key(lab.seed), _UNSEEN), config.worlds)
-    worlds = in_threads(lambda n: judge_building(order, config, lab, keys[n], drawn=n == 0), range(config.worlds))
+    worlds = [judge_building(order, config, lab, key, drawn=n == 0) for n, key in enumerate(keys)]
     numbers = {name: told([found[name] for found, _ in worlds], order) for name in PROPOSALS}
     return {"order": order, "pictures": {str(order): worlds[0][1]}, **numbers}
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from lab import PROPOSALS, Everything, Lab, Piece, column, in_threads
+from lab import PROPOSALS, Everything, Lab, Piece, column
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scenes import Change, Condition, Scans, beams_of, map_and_building, take
@@ -100,7 +100,7 @@ class Bed:
             root = jax.random.fold_in(jax.random.key(lab.seed), _UNSEEN)
             keys = jax.random.split(root, self.config.worlds)
             network = lab.networks["dsom"]
-            worlds = in_threads(lambda n: self.world(n, keys[n], condition, network), range(len(keys)))
+            worlds = [self.world(n, key, condition, network) for n, key in enumerate(keys)]
             parts = {name: [found[name] for _, found in worlds] for name in PROPOSALS}
             self.judged[condition] = {name: told(part) for name, part in parts.items()}
             self.judged[condition]["contradicting"] = beams_of([scans for scans, _ in worlds])

@@ -167,9 +167,11 @@ def _finish(ax: Axes) -> None:
 
 def section(everything: Everything) -> str:
     """Table I, retention and causes of departures."""
-    first = [TABLE_1, t_cut_table(everything), "![Errors by T_cut](FIGURES/t_cut.png)"]
-    return "\n\n".join([*(first if DSOM in everything[NAME] else []), RETENTION,
-                        departure_table(everything), "![Retention by T_cut](FIGURES/retention.png)"])  # fmt: skip
+    first = []
+    if DSOM in everything[NAME]:
+        first = [TABLE_1, t_cut_table(everything), "![Errors by T_cut](FIGURES/t_cut.png)"]
+    last = [RETENTION, departure_table(everything), "![Retention by T_cut](FIGURES/retention.png)"]
+    return "\n\n".join([*first, *last])
 
 
 def t_cut_table(everything: Everything) -> str:
