@@ -115,8 +115,7 @@ class Lab:
     def by_sequence(self, work: Callable[..., T]) -> list[T]:
         """``work(number, map's name, map, episode)`` of each sequence, one after the other.
 
-        Not in threads: what runs beside another computation in one process differs from it in the last bits of very
-        small probabilities, of which ``hybrid`` and Alg 1 with DSOM make other runs.
+        Not in threads: beside another computation in the same process, some runs with DSOM and hybrid came out otherwise.
         """
         return [work(number, *parts) for number, parts in enumerate(self.suite.episodes)]
 
