@@ -115,7 +115,7 @@ class Lab:
     def by_sequence(self, work: Callable[..., T]) -> list[T]:
         """``work(number, map's name, map, episode)`` of each sequence, one after the other.
 
-        Not in threads: beside another computation in the same process, some runs with DSOM and hybrid came out otherwise.
+        Not in threads: beside another computation in one process, some runs with DSOM and hybrid came out otherwise.
         """
         return [work(number, *parts) for number, parts in enumerate(self.suite.episodes)]
 
