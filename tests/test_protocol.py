@@ -78,11 +78,11 @@ def test_a_map_replaces_what_it_names():
     assert plan.on("b")[0].logs == ("all.log",) and plan.on("b")[0].adapt == plan.adapt
 
 
-def made_suite(grid, mount=(0.0, 0.0, 0.0), far=1.0) -> Suite:
+def made_suite(grid, far=1.0) -> Suite:
     """Two clips of three scans."""
     still = jnp.zeros((3, 3))
     clip = Episode(jnp.full((3, 4), far), still, still, jnp.zeros(3, bool), jnp.arange(3.0))
-    return Suite("made, m", LidarConfig(4, mount=mount), (), (("m", grid, clip),) * 2)
+    return Suite("made, m", LidarConfig(4), (), (("m", grid, clip),) * 2)
 
 
 def test_results_are_kept_only_of_the_same_map_logs_and_network(tmp_path):

@@ -301,6 +301,29 @@ def test_a_job_that_fails_stops_no_other(tmp_path, capsys):
     assert calls == ["a", "b", "c", "d", "a", "c"]
 
 
+def test_results_of_another_network_are_told(tmp_path, capsys):
+    import run as script
+
+    piece = lab.Piece(
+        "made", comparison.Config(), lambda _: {"a": lambda _: {"value": 1.5}}, lambda _: {}, lambda _: ""
+    )
+    for some, told in ((lab.Lab(), "made.a: kept\n"), (lab.Lab(), "other settings or networks")):
+        script.run_piece(piece, lab.Lab(), script.Args(), tmp_path)
+        capsys.readouterr()
+        if "networks" in told:
+            some.__dict__["origins"] = {"dsom": "0" * 12}
+        script.run_piece(piece, some, script.Args(), tmp_path)
+        assert told in capsys.readouterr().out
+
+
+def test_retention_of_a_robust_filter_alone_has_a_page():
+    import retention
+
+    kept = lab.read(ROOT / "experiments" / "synthetic" / "results" / "retention.robust_dsom.json")
+    page = retention.section({"retention": {"robust_dsom": kept}})
+    assert "robust_dsom" in page and retention.TABLE_1 not in page
+
+
 def test_a_damaged_result_is_named(tmp_path):
     (tmp_path / "made.a.json").write_text('{"made": ')
     with pytest.raises(UserError, match=r"made\.a\.json"):

@@ -1,6 +1,6 @@
 """The synthetic report: ``python experiments/synthetic/run.py [--only comparison ...] [--runs 100] [--force]``.
 
-From the networks in ``checkpoints``, on two cores in less than an hour; ``--runs 20`` is a look at all of it in less.
+From the networks in ``checkpoints``, on two cores in about an hour; ``--runs 20`` is a look at all of it in less.
 Every job writes ``results/PIECE.JOB.json``; what exists is kept, so that an interrupted run continues where it was, and
 a job that fails does not keep the others from being run. Figures (PNG and PDF) and ``experiments/REPORT.md`` are made
 from these files at the end.
