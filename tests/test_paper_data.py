@@ -8,6 +8,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import math
+import shutil
 import sys
 from pathlib import Path
 from typing import Any
@@ -24,8 +25,8 @@ from dsom_jax.errors import UserError, run_cli
 from dsom_jax.filters.methods import REAL
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.protocol import command
-from dsom_jax.protocol.running import read_traces
 from dsom_jax.raycast import RaycastConfig, cast_rays, make_tables
+from dsom_jax.run_table import from_columns
 from fixtures.make_bag import write_bag
 from tiny_log import UPDATES, path
 
@@ -208,8 +209,8 @@ def test_upo_from_a_bag(upo, tmp_path, capsys):
         data = json.loads((out / f"{stem}.json").read_text())
         assert (data["runs"], data["particles"], data["updates"]) == (2, 40, 8)
         assert data["global"]["experiments"] == data["kidnap"]["experiments"] == 6
-        table, errors = read_traces(work / f"{stem}.npz")
-        assert len(table.run) == 2 * 3 * 2 and errors.shape == (3, 2, 16) and set(table.method) == {stem}
+        table = from_columns(stem, data["each_run"])
+        assert len(table.run) == 2 * 3 * 2 and [len(band["mean"]) for band in data["evolution"]] == [16] * 3
         assert (work / f"{stem}.png").is_file()
     assert {f"{name}.{ending}" for name in ("error_evolution", "position_error") for ending in ("png", "pdf")} <= {
         path.name for path in out.iterdir()
@@ -229,6 +230,11 @@ def test_upo_from_a_bag(upo, tmp_path, capsys):
         "done", "kept", "kept", "kept",
     ]  # fmt: skip
     assert {stem: (out / f"{stem}.json").stat().st_mtime_ns for stem in stems[1:]} == {s: made[s] for s in stems[1:]}
+    # The page comes from the results alone: a checkout without pictures and networks draws it again.
+    shutil.rmtree(tmp_path / "work")
+    call_script(config, upo, tmp_path)
+    assert capsys.readouterr().out.count("kept") == 4
+    assert (tmp_path / "out" / "upo" / "REPORT.md").read_text() == text
 
 
 def test_the_pose_of_the_drawing_undoes_the_authors_transform():

@@ -92,9 +92,9 @@ def test_results_are_kept_only_of_the_same_map_logs_and_network(tmp_path):
     grid = from_cells(np.eye(8, dtype=bool), ~np.eye(8, dtype=bool), resolution=0.1)
     first = running.identity(variant, plan, made_suite(grid), start)
     (tmp_path / f"{variant.stem}.json").write_text(json.dumps(first))
-    assert not running.is_done(variant, first, tmp_path, tmp_path)
-    (tmp_path / f"{variant.stem}.npz").touch()
-    assert running.is_done(variant, first, tmp_path, tmp_path)
+    assert not running.is_done(variant, first, tmp_path)  # no runs to compare
+    (tmp_path / f"{variant.stem}.json").write_text(json.dumps(first | {"each_run": {}}))
+    assert running.is_done(variant, first, tmp_path)
     again = running.identity(variant, plan, made_suite(grid), start)
     moved = from_cells(grid.occupied, grid.free, resolution=0.1, origin=(0.01, 0.0, 0.0))
     changed = [
@@ -104,7 +104,7 @@ def test_results_are_kept_only_of_the_same_map_logs_and_network(tmp_path):
     ]
     (start / "provenance.json").write_text("{ }")
     changed.append(running.identity(variant, plan, made_suite(grid), start))
-    assert again == first and not any(running.is_done(variant, c, tmp_path, tmp_path) for c in changed)
+    assert again == first and not any(running.is_done(variant, c, tmp_path) for c in changed)
 
 
 def test_mounts_that_differ_by_rounding_are_one_lidar():

@@ -23,14 +23,13 @@ from dsom_jax.metrics import Runs, measure_errors, pool, summarize
 from dsom_jax.montecarlo import run, run_keys
 from dsom_jax.occupancy import from_cells
 from dsom_jax.raycast import RaycastConfig, cast_rays, make_tables
-from dsom_jax.run_table import RunTable, join, run_rows
+from dsom_jax.run_table import RunTable, columns_of, from_columns, join, run_rows
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "experiments" / "synthetic"))
 
 import comparison  # noqa: E402
 import departures  # noqa: E402
-import kept_runs  # noqa: E402
 import lab  # noqa: E402
 import paper  # noqa: E402
 import side_by_side  # noqa: E402
@@ -158,7 +157,7 @@ def made_results(better: str) -> dict[str, Any]:
         entry = {phase: summarize(pool(runs)) for phase, runs in parts.items()} | {"ms_per_step": 1.0}
         band = {"mean": [20.0, error], "low": [19.0, error], "high": [21.0, error]}
         config = {"runs": 20, "methods": list(comparison.COMPARED)}
-        results[name] = {"made": made(config), "summary": entry, "runs": kept_runs.rows(join(rows)),
+        results[name] = {"made": made(config), "summary": entry, "runs": columns_of(join(rows)),
                          "evolution": [band] * 6, "kidnapped": [[1]] * 6}  # fmt: skip
     return results
 
@@ -212,7 +211,7 @@ def everything() -> dict[str, Any]:
     """Made results of the pieces that the comparison is not, as small as they can be."""
     runs = {phase: [made_runs(n, 3, 0.1)] for n, phase in enumerate(comparison.PHASES)}
     summary = {phase: summarize(pool(some)) for phase, some in runs.items()}
-    entry = {"summary": summary, "runs": kept_runs.rows(join([run_rows("x", p, 0, 0, r[0]) for p, r in runs.items()]))}
+    entry = {"summary": summary, "runs": columns_of(join([run_rows("x", p, 0, 0, r[0]) for p, r in runs.items()]))}
     left = {key: 0.5 for key in ("per_100_updates", "dragged", "returned", "length_median")} | {"count": 3}
     left |= {f"{key}{which}": 0.5 for key in ("pm_poor", "doubted", "redrawn") for which in ("", "_otherwise")}
     keys = ("mass_mean", "mass_gt_1pct", "top1")
@@ -261,8 +260,8 @@ def test_typical_scans_are_medians():
 def test_numbers_survive_the_file(tmp_path):
     table = join([run_rows("mcl", "global", 0, 0, made_runs(1, 3, 0.1))])
     table.e_pos_m[0], table.retention[1] = np.inf, np.nan
-    lab.write(tmp_path / "x.json", {"runs": kept_runs.rows(table)})
-    back = kept_runs.table("mcl", lab.read(tmp_path / "x.json")["runs"])
+    lab.write(tmp_path / "x.json", {"runs": columns_of(table)})
+    back = from_columns("mcl", lab.read(tmp_path / "x.json")["runs"])
     np.testing.assert_allclose(back.e_pos_m, table.e_pos_m, rtol=1e-5)
     np.testing.assert_allclose(back.retention, table.retention, rtol=1e-5)
     np.testing.assert_array_equal(back.steps, table.steps)

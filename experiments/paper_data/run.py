@@ -25,7 +25,7 @@ class Args(command.Args):
     out: Path = HERE_RESULTS
     """Folder for results, tables and figures; a folder named as the configuration is made in it."""
     work: Path = RUNS
-    """Folder for networks and single runs, likewise."""
+    """Folder for adapted networks and pictures of runs, likewise."""
 
 
 def main(args: Args) -> None:

@@ -2,7 +2,7 @@
 
 For each map of ``paper.yaml``: the network is adapted to the building, three clips of the log are chosen and joined as
 kidnappings, and every method is run on them. ``paper/MAP/METHOD.json`` are the results; ``paper/REPORT.md`` and the
-figures come from them. Networks and single runs lie in ``--work``. What exists is kept, so an interrupted series
+figures come from them. Networks and pictures of runs lie in ``--work``. What exists is kept, so an interrupted series
 continues where it was; ``--adapt-minutes 0`` takes the network as it is.
 """
 
@@ -32,7 +32,7 @@ class Args(command.Args):
     out: Path = HERE / "paper"
     """Folder for results, tables and figures."""
     work: Path = ROOT / "runs" / "real"
-    """Folder for networks and single runs, which a repetition takes up again."""
+    """Folder for adapted networks, which a repetition takes up again, and pictures of runs."""
 
 
 if __name__ == "__main__":

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import paper
-from kept_runs import rows, table
 from lab import Everything, Lab, Piece, Results
 from matplotlib.figure import Figure
 from tables import bounds, markdown, number, percent
@@ -17,7 +16,7 @@ from tables import bounds, markdown, number, percent
 from dsom_jax import bench, plotting
 from dsom_jax.filters.methods import METHODS, WEIGHT_POWER
 from dsom_jax.metrics import STEP_BINS
-from dsom_jax.run_table import RunTable, join
+from dsom_jax.run_table import RunTable, columns_of, from_columns, join
 
 NAME = "comparison"
 PHASES = ("global", "kidnap")
@@ -48,8 +47,8 @@ def compare(name: str, config: Config, lab: Lab) -> dict[str, Any]:
     """One method on all sequences: its entry of ``bench.json``, every run, and E_pos over time."""
     settings = bench.Settings(config.runs, config.particles, config.t_cut, lab.seed, config.weight_power)
     entry, record = lab.compare(name, settings)
-    return {"summary": entry, "runs": rows(record.table), "evolution": [band(trace) for trace in record.traces],
-            "kidnapped": kidnappings(lab)}  # fmt: skip
+    bands = [plotting.band_of(trace) for trace in record.traces]
+    return {"summary": entry, "runs": columns_of(record.table), "evolution": bands, "kidnapped": kidnappings(lab)}
 
 
 def kidnappings(lab: Lab) -> list[list[int]]:
@@ -59,13 +58,7 @@ def kidnappings(lab: Lab) -> list[list[int]]:
 
 def table_of(results: Results, methods: Sequence[str]) -> RunTable:
     """All runs of ``methods``."""
-    return join([table(name, results[name]["runs"]) for name in methods])
-
-
-def band(trace: np.ndarray) -> dict[str, list[float]]:
-    """Mean E_pos over the runs (R, T) at each update, metres, with its bootstrap 95 % interval."""
-    mean, low, high = plotting.confidence_band(trace)
-    return {"mean": mean.tolist(), "low": low.tolist(), "high": high.tolist()}
+    return join([from_columns(name, results[name]["runs"]) for name in methods])
 
 
 def errors_of(results: Results, methods: Sequence[str], which: str) -> dict[str, dict[str, np.ndarray]]:

@@ -43,9 +43,6 @@ PROPOSALS = {
 }
 """Proposals that are compared: what figures call them, and their colours."""
 NETWORKS = ("dsom", "pf_net", "pfrnn")
-DIGITS = 6
-"""Significant digits that are kept of every number."""
-
 Results = Mapping[str, dict[str, Any]]
 """What the jobs of one piece gave, by job."""
 Everything = Mapping[str, Results]
@@ -200,9 +197,8 @@ def _cpuinfo() -> list[str]:
 
 
 def write(path: Path, data: dict[str, Any]) -> None:
-    """Strict JSON on as few lines as can be read, with :data:`DIGITS` digits; NaN and infinities become null."""
-    rows = [f" {json.dumps(key)}: {json.dumps(_rounded(report.plain(data[key])), allow_nan=False)}" for key in data]
-    report.write_text(path, "{\n" + ",\n".join(rows) + "\n}\n")
+    """Strict JSON on as few lines as can be read, with six digits; NaN and infinities become null."""
+    report.write_rows(path, report.rounded(report.plain(data)))
 
 
 def read(path: Path) -> dict[str, Any]:
@@ -217,14 +213,6 @@ def read(path: Path) -> dict[str, Any]:
 def result_path(folder: Path, piece: str, job: str) -> Path:
     """Where the numbers of a job are kept."""
     return folder / f"{piece}.{job.replace(' ', '_')}.json"
-
-
-def _rounded(data: Any) -> Any:
-    if isinstance(data, dict):
-        return {key: _rounded(value) for key, value in data.items()}
-    if isinstance(data, list):
-        return [_rounded(value) for value in data]
-    return float(f"{data:.{DIGITS}g}") if isinstance(data, float) else data
 
 
 def column(values: Any) -> np.ndarray:

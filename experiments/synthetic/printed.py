@@ -8,11 +8,11 @@ from functools import partial
 from typing import Any
 
 import comparison
-from kept_runs import rows
 from lab import Everything, Lab, Piece
 from tables import bounds, markdown, number, percent
 
 from dsom_jax import bench
+from dsom_jax.run_table import columns_of
 
 NAME = "printed"
 
@@ -37,7 +37,7 @@ def run(name: str, config: Config, lab: Lab) -> dict[str, Any]:
     """One method on all sequences."""
     settings = bench.Settings(config.runs, config.particles, config.t_cut, lab.seed, config.weight_power)
     entry, record = lab.compare(name, settings)
-    return {"summary": entry, "runs": rows(record.table)}
+    return {"summary": entry, "runs": columns_of(record.table)}
 
 
 def section(everything: Everything) -> str:

@@ -10,7 +10,6 @@ import jax
 import numpy as np
 import paper
 from departures import Part, Scene, departures
-from kept_runs import rows
 from lab import PROPOSALS, Everything, Lab, Piece, column
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -24,7 +23,7 @@ from dsom_jax.filters.methods import COMBINATIONS
 from dsom_jax.montecarlo import run
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.plotting.common import legend, log_ticks
-from dsom_jax.run_table import RunTable, join, run_rows
+from dsom_jax.run_table import RunTable, columns_of, join, run_rows
 from dsom_jax.training import quality
 
 NAME = "retention"
@@ -95,7 +94,7 @@ def told(parts: list[Part], t_cut: float | None) -> dict[str, Any]:
             pooled[phase] += runs
             found += [run_rows(part.method, phase, part.number, n, some) for n, some in enumerate(runs)]
     summaries = {phase: metrics.summarize(metrics.pool(runs)) for phase, runs in pooled.items()}
-    return {"summary": summaries, "runs": rows(join(found)), "departures": departures(parts, t_cut)}
+    return {"summary": summaries, "runs": columns_of(join(found)), "departures": departures(parts, t_cut)}
 
 
 PHASES = {"global": "Global localization", "kidnap": "Kidnapping"}

@@ -17,10 +17,9 @@ import numpy as np
 import paper
 import particles
 import retention
-from kept_runs import table
 from lab import Everything
 
-from dsom_jax.run_table import RunTable, join, paired
+from dsom_jax.run_table import RunTable, from_columns, join, paired
 from dsom_jax.statistics import (
     Evidence,
     Verdict,
@@ -48,7 +47,7 @@ def verdicts(everything: Everything) -> list[Verdict]:
 def runs_of(everything: Everything) -> RunTable | None:
     """The runs of the comparison that all its methods have."""
     results = everything.get(comparison.NAME, {})
-    return shared([table(name, entry["runs"]) for name, entry in results.items()]) if results else None
+    return shared([from_columns(name, entry["runs"]) for name, entry in results.items()]) if results else None
 
 
 def shared(tables: Sequence[RunTable]) -> RunTable:
@@ -157,7 +156,7 @@ def accuracy_numbers(everything: Everything) -> Claim:
     """Table II, value by value."""
     evidence = []
     for count, entry in particles.by_count(everything).items() if particles.NAME in everything else ():
-        runs = table(OURS, entry["runs"])
+        runs = from_columns(OURS, entry["runs"])
         for phase in PHASES:
             side = runs.rows((runs.phase == phase) & runs.converged)
             if not len(side.run):
@@ -173,7 +172,7 @@ def more_particles(everything: Everything) -> Claim:
     found, evidence = particles.by_count(everything) if particles.NAME in everything else {}, []
     counts = sorted(found)
     for few, many in pairwise(counts):
-        both = shared([table(str(n), found[n]["runs"]) for n in (few, many)])
+        both = shared([from_columns(str(n), found[n]["runs"]) for n in (few, many)])
         for phase in PHASES:
             a, b = paired(both, str(many), str(few), phase)
             kept = a.converged & b.converged
@@ -188,7 +187,7 @@ def insensitive(everything: Everything) -> Claim:
     cuts = [cut for cut in found if float(cut) in paper.T_CUT]
     evidence = []
     for phase in PHASES if len(cuts) > 1 else ():
-        sides = [table(cut, found[cut]["runs"]) for cut in cuts]
+        sides = [from_columns(cut, found[cut]["runs"]) for cut in cuts]
         sides = [side.rows((side.phase == phase) & side.converged) for side in sides]
         if not all(len(side.run) for side in sides):
             continue

@@ -49,11 +49,10 @@ def write_text(path: Path, text: str) -> None:
     write_atomic(path, text.encode())
 
 
-def write_runs(path: Path, table: RunTable, **others: np.ndarray) -> None:
-    """Write the columns of ``table``, and ``others``, to ``path`` (npz), atomically."""
+def write_runs(path: Path, table: RunTable) -> None:
+    """Write the columns of ``table`` to ``path`` (npz), atomically."""
     buffer = io.BytesIO()
-    columns: dict[str, Any] = {**table._asdict(), **others}
-    np.savez_compressed(buffer, **columns)
+    np.savez_compressed(buffer, **table._asdict())
     write_atomic(path, buffer.getvalue())
 
 
@@ -71,6 +70,21 @@ def read_runs(path: str | Path) -> RunTable:
 def write_json(path: Path, data: Any) -> None:
     """Write ``data`` to ``path`` atomically as strict JSON: NaN and infinities become null."""
     write_text(path, json.dumps(plain(data), indent=2, allow_nan=False) + "\n")
+
+
+def write_rows(path: Path, data: dict[str, Any]) -> None:
+    """As :func:`write_json`, one line for each entry of ``data``: for long lists."""
+    rows = [f" {json.dumps(str(key))}: {json.dumps(plain(data[key]), allow_nan=False)}" for key in data]
+    write_text(path, "{\n" + ",\n".join(rows) + "\n}\n")
+
+
+def rounded(data: Any, digits: int = 6) -> Any:
+    """:func:`plain` data with so many significant digits."""
+    if isinstance(data, dict):
+        return {key: rounded(value, digits) for key, value in data.items()}
+    if isinstance(data, list):
+        return [rounded(value, digits) for value in data]
+    return float(f"{data:.{digits}g}") if isinstance(data, float) else data
 
 
 def plain(data: Any) -> Any:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -55,6 +55,23 @@ def run_rows(method: str, phase: str, sequence: int, part: int, runs: Runs) -> R
     columns: list[np.ndarray] = [np.full(count, value) for value in (method, phase, sequence, part)]
     columns += [np.arange(count), np.asarray(runs.steps, int), np.asarray(runs.e_pos), np.asarray(runs.e_theta)]
     return RunTable(*[*columns, retention])
+
+
+COLUMNS = RunTable._fields[1:]
+"""What :func:`columns_of` keeps."""
+
+
+def columns_of(table: RunTable) -> dict[str, list[Any]]:
+    """The runs of one method as lists, without its name."""
+    return {name: getattr(table, name).tolist() for name in COLUMNS}
+
+
+def from_columns(method: str, kept: Mapping[str, Sequence[Any]]) -> RunTable:
+    """What :func:`columns_of` kept, as JSON has it: null is an infinite error, or a retention of NaN."""
+    missing = {"e_pos_m": np.inf, "e_theta_rad": np.inf, "retention": np.nan}
+    numbers = [np.array([other if v is None else v for v in kept[name]], float) for name, other in missing.items()]
+    integers = [np.array(kept[name], int) for name in ("sequence", "part", "run", "steps")]
+    return RunTable(np.full(len(kept["phase"]), method), np.array(kept["phase"]), *integers, *numbers)
 
 
 def join(tables: Sequence[RunTable]) -> RunTable:

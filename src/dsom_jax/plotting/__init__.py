@@ -5,9 +5,9 @@ Every function returns a matplotlib ``Figure`` that no window system knows of; :
 
 from dsom_jax.plotting.charts import (
     band_evolution,
+    band_of,
     benchmark_figures,
     calibration_curves,
-    confidence_band,
     error_boxes,
     error_evolution,
     step_bars,
@@ -17,9 +17,9 @@ from dsom_jax.plotting.maps import map_view, map_views, moment_figure
 
 __all__ = [
     "band_evolution",
+    "band_of",
     "benchmark_figures",
     "calibration_curves",
-    "confidence_band",
     "error_boxes",
     "error_evolution",
     "map_view",

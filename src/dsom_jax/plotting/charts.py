@@ -87,11 +87,14 @@ Band = Mapping[str, Any]
 
 def error_evolution(traces: Sequence[Mapping[str, np.ndarray]], kidnapped: Sequence[Any]) -> Figure:
     """Mean E_pos (metres) over the updates with its 95 % band: per episode {method: (R, T)} and kidnap flags (T,)."""
-    bands = [
-        {name: dict(zip(("mean", "low", "high"), confidence_band(errors), strict=True)) for name, errors in by.items()}
-        for by in traces
-    ]
+    bands = [{name: band_of(errors) for name, errors in by.items()} for by in traces]
     return band_evolution(bands, [np.flatnonzero(np.asarray(moved)).tolist() for moved in kidnapped])
+
+
+def band_of(errors: np.ndarray) -> Band:
+    """Mean of ``errors`` (R, T) over the runs at each update, with its bootstrap 95 % interval."""
+    mean, low, high = confidence_band(errors)
+    return {"mean": mean.tolist(), "low": low.tolist(), "high": high.tolist()}
 
 
 def band_evolution(bands: Sequence[Mapping[str, Band]], kidnapped: Sequence[Sequence[int]]) -> Figure:

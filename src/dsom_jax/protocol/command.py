@@ -30,7 +30,7 @@ class Args:
     out: Path
     """Folder for results, tables and figures."""
     work: Path
-    """Folder for networks and single runs, which a repetition takes up again."""
+    """Folder for adapted networks, which a repetition takes up again, and pictures of runs."""
     checkpoint: Path | None = None
     """Network to start from; default: the one in the repository."""
     adapt_minutes: float | None = None
@@ -58,7 +58,7 @@ def main(args: Args) -> None:
         map_yaml = map_file(name, fields, args.data, work)
         suite = choose(one, logs[name], name, load_map(map_yaml))
         run_map(one, suite, map_yaml, start, name, out, work)
-        write_report(plan, out, work)
+        write_report(plan, out)
 
 
 def start_network(plan: Plan, args: Args) -> Path | None:
@@ -89,7 +89,7 @@ def run_map(plan: Plan, suite: Suite, map_yaml: Path, start: Path | None, name: 
     build = Builder(plan, suite, network)
     for variant in variants(plan):
         made_of = identity(variant, plan, suite, begun(variant))
-        if is_done(variant, made_of, *folders):
+        if is_done(variant, made_of, folders[0]):
             print(f"{name}, {variant.stem}: kept", flush=True)
             continue
         run_variant(variant, plan, suite, build, made_of, *folders)

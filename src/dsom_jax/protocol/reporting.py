@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,8 +11,8 @@ import numpy as np
 
 from dsom_jax import plotting, report
 from dsom_jax.protocol.plan import Plan, Variant, variants
-from dsom_jax.protocol.running import read_traces
-from dsom_jax.run_table import RunTable, join, paired
+from dsom_jax.protocol.running import read_entry
+from dsom_jax.run_table import RunTable, from_columns, join, paired
 from dsom_jax.statistics import Evidence, corrected, rate_evidence, value_evidence
 
 COLUMNS = ("method", "network", "T_cut", "converged %", "steps", "E_pos m", "kept %", "strict %", "sure and wrong %")
@@ -30,7 +29,7 @@ Every clip starts without any prior on the pose; at its end the robot is carried
 """
 
 
-def write_report(plan: Plan, out: Path, work: Path) -> None:
+def write_report(plan: Plan, out: Path) -> None:
     """``out``/REPORT.md with everything that is there, and the figures of each map."""
     parts = [f"# {plan.name}\n\nWritten by the experiment's command from its results; do not edit.\n\n{LEGEND}"]
     for name in plan.maps:
@@ -39,15 +38,15 @@ def write_report(plan: Plan, out: Path, work: Path) -> None:
             continue
         parts.append(f"\n## {name}\n\n{made_with(entries)}\n")
         parts += [table(entries, phase) for phase in PHASES]
-        parts.append(tests(plan, work / name, entries))
-        figures(plan, out / name, work / name, entries)
+        parts.append(tests(plan, entries))
+        figures(plan, out / name, entries)
     report.write_text(out / "REPORT.md", "\n".join(parts))
 
 
 def load_entries(plan: Plan, folder: Path) -> dict[Variant, dict[str, Any]]:
     """The results of one map that exist, in the order of the plan."""
-    files = {variant: folder / f"{variant.stem}.json" for variant in variants(plan)}
-    return {variant: json.loads(path.read_text()) for variant, path in files.items() if path.is_file()}
+    found = {variant: read_entry(folder, variant) for variant in variants(plan)}
+    return {variant: entry for variant, entry in found.items() if entry is not None}
 
 
 def made_with(entries: dict[Variant, dict[str, Any]]) -> str:
@@ -124,16 +123,26 @@ def pairs(entries: dict[Variant, dict[str, Any]]) -> Iterator[tuple[Variant, Var
     yield from ((a, b) for a, b in chosen if a and b)
 
 
-def tests(plan: Plan, work: Path, entries: dict[Variant, dict[str, Any]]) -> str:
+def comparable(entries: dict[Variant, dict[str, Any]], variant: Variant, other: Variant) -> bool:
+    """Whether both have every run, of the same map, clips, seed and number of runs."""
+    sides = [entries[variant], entries[other]]
+    same = ("map_digest", "clips_digest", "seed", "runs")
+    return all("each_run" in side for side in sides) and all(sides[0][key] == sides[1][key] for key in same)
+
+
+def runs_of(variant: Variant, entry: dict[str, Any]) -> RunTable:
+    """All runs of a result, under the name of the variant."""
+    return from_columns(variant.stem, entry["each_run"])
+
+
+def tests(plan: Plan, entries: dict[Variant, dict[str, Any]]) -> str:
     """Paired comparisons of both phases, corrected as one family."""
-    found = [
-        (a, b) for a, b in pairs(entries) if (work / f"{a.stem}.npz").is_file() and (work / f"{b.stem}.npz").is_file()
-    ]
+    found = [(a, b) for a, b in pairs(entries) if comparable(entries, a, b)]
     if not found:
         return ""
     evidence: list[Evidence] = []
     for a, b in found:
-        both = join([read_traces(work / f"{v.stem}.npz")[0] for v in (a, b)])
+        both = join([runs_of(v, entries[v]) for v in (a, b)])
         for phase in PHASES:
             evidence += compare(both, a, b, phase, plan.seed)
     lines = ["| a against b | phase | what | a - b [95 % interval] | p (Holm) |", "| --- | --- | --- | ---: | ---: |"]
@@ -163,17 +172,16 @@ def line(piece: Evidence) -> str:
     return f"| `{a}`, `{b}` | {phase} | {what} | {piece.estimate:.3f} [{piece.low:.3f}, {piece.high:.3f}] | {p} |"
 
 
-def figures(plan: Plan, out: Path, work: Path, entries: dict[Variant, dict[str, Any]]) -> None:
+def figures(plan: Plan, out: Path, entries: dict[Variant, dict[str, Any]]) -> None:
     """Error over the updates with its 95 % band, as in the paper's figures of real data; boxes of final errors."""
-    runs = {v: read_traces(work / f"{v.stem}.npz") for v in entries if (work / f"{v.stem}.npz").is_file()}
+    runs = {v: runs_of(v, entry) for v, entry in entries.items() if "each_run" in entry}
     shown = [v for v in runs if v.name in (plan.shown or plan.methods) and v.t_cut in (None, plan.t_cuts[0])]
     if not shown:
         return
-    clips = range(len(runs[shown[0]][1]))
-    traces = [{v.name: runs[v][1][clip] for v in shown} for clip in clips]
-    moved = np.arange(2 * plan.updates) == plan.updates
-    evolution = plotting.error_evolution(traces, [moved] * len(traces))
-    boxes = plotting.error_boxes({phase: {v.name: final(runs[v][0], phase) for v in shown} for phase in PHASES})
+    clips = range(len(entries[shown[0]]["evolution"]))
+    bands = [{v.name: entries[v]["evolution"][clip] for v in shown} for clip in clips]
+    evolution = plotting.band_evolution(bands, [[plan.updates]] * len(bands))
+    boxes = plotting.error_boxes({phase: {v.name: final(runs[v], phase) for v in shown} for phase in PHASES})
     for name, figure in (("error_evolution", evolution), ("position_error", boxes)):
         for ending in ("png", "pdf"):
             plotting.save(figure, out / f"{name}.{ending}")

@@ -9,8 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from dsom_jax import bench, checkpoint, plotting, report
 from dsom_jax.data.suite import Suite
 from dsom_jax.episode import Episode
@@ -21,7 +19,7 @@ from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.proposals.dual_features import with_episode
 from dsom_jax.protocol.digests import clips_digest, map_digest
 from dsom_jax.protocol.plan import Plan, Variant
-from dsom_jax.run_table import RunTable
+from dsom_jax.run_table import columns_of
 from dsom_jax.types import Filter, Proposal
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -57,16 +55,19 @@ class Builder:
 def run_variant(
     variant: Variant, plan: Plan, suite: Suite, build: Builder, made_of: dict[str, Any], out: Path, work: Path
 ) -> None:
-    """One method on all clips: OUT/STEM.json, with what it is ``made_of``, and every run and a picture in WORK."""
+    """One method on all clips: OUT/STEM.json, with what it is ``made_of`` and every run, and a picture in WORK."""
     keys = [run_keys(plan.seed, number, plan.runs) for number in range(len(suite.episodes))]
     record = bench.run_method(variant.method, suite, keys, lambda _, __, grid, episode: build(variant, grid, episode))
     shared = bench.Settings(plan.runs, plan.particles, variant.t_cut or plan.t_cuts[0], plan.seed)
     entry = bench.summary(suite, {variant.method: record}, shared)["methods"][variant.method]
     draw(variant, suite, record, work)
-    save_runs(work / f"{variant.stem}.npz", record, variant.stem)
+    entry |= {
+        "each_run": report.rounded(columns_of(record.table)),
+        "evolution": report.rounded([plotting.band_of(trace) for trace in record.traces]),
+    }
     facts = {"variant": variant.name, "t_cut": variant.t_cut, **made_of, "commit": commit()}
     facts["network"] = network_facts(build.networks(variant), variant)
-    report.write_json(out / f"{variant.stem}.json", facts | entry)
+    report.write_rows(out / f"{variant.stem}.json", facts | entry)
 
 
 def network_facts(folder: Path | None, variant: Variant) -> dict[str, Any] | None:
@@ -94,28 +95,22 @@ def identity(variant: Variant, plan: Plan, suite: Suite, start: Path | None) -> 
     }  # fmt: skip
 
 
-def is_done(variant: Variant, made_of: dict[str, Any], out: Path, work: Path) -> bool:
-    """Whether the results of a variant are there and :func:`identity` was the same."""
+def is_done(variant: Variant, made_of: dict[str, Any], out: Path) -> bool:
+    """Whether the results of a variant are there with all runs, and :func:`identity` was the same."""
+    found = read_entry(out, variant)
+    return found is not None and "each_run" in found and all(found.get(k) == value for k, value in made_of.items())
+
+
+def read_entry(out: Path, variant: Variant) -> dict[str, Any] | None:
+    """What :func:`run_variant` wrote, None if there is nothing; UserError for anything else."""
     path = out / f"{variant.stem}.json"
-    if not (path.is_file() and (work / f"{variant.stem}.npz").is_file()):
-        return False
+    if not path.is_file():
+        return None
     try:
-        found = json.loads(path.read_text())
-    except json.JSONDecodeError as error:
+        found: dict[str, Any] = json.loads(path.read_text())
+    except ValueError as error:
         raise UserError(f"{path}: not JSON ({error}); delete it to have it made again") from None
-    return all(found.get(name) == value for name, value in made_of.items())
-
-
-def save_runs(path: Path, record: bench.Record, name: str) -> None:
-    """Every single run and E_pos over the updates, metres (clips, runs, updates)."""
-    table = record.table._replace(method=np.full(len(record.table.run), name))
-    report.write_runs(path, table, e_pos=np.stack(record.traces).astype(np.float32))
-
-
-def read_traces(path: Path) -> tuple[RunTable, np.ndarray]:
-    """What :func:`save_runs` wrote."""
-    with np.load(path) as columns:
-        return report.read_runs(path), columns["e_pos"]
+    return found
 
 
 def draw(variant: Variant, suite: Suite, record: bench.Record, work: Path) -> None:
