@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import sys
 from functools import partial
@@ -292,12 +293,42 @@ def test_a_job_that_fails_stops_no_other(tmp_path, capsys):
         return {name: partial(job, name, error) for name, error in errors.items()}
 
     piece = lab.Piece("made", comparison.Config(), jobs, lambda _: {}, lambda _: "")
-    assert script.run_piece(piece, lab.Lab(), script.Args(), tmp_path) == ["made.a", "made.c"]
+    assert script.run_pieces([piece], lab.Lab(), script.Args(workers=1), tmp_path) == ["made.a", "made.c"]
     assert "ValueError: too odd" in capsys.readouterr().err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["made.b.json", "made.d.json"]
     # Again: what is there is kept, what failed is tried.
-    assert script.run_piece(piece, lab.Lab(), script.Args(), tmp_path) == ["made.a", "made.c"]
+    assert script.run_pieces([piece], lab.Lab(), script.Args(workers=1), tmp_path) == ["made.a", "made.c"]
     assert calls == ["a", "b", "c", "d", "a", "c"]
+
+
+def test_processes_give_the_numbers_of_one(tmp_path):
+    import run as script
+
+    folders = [tmp_path / "one", tmp_path / "two"]
+    for workers, folder in enumerate(folders, 1):
+        folder.mkdir()
+        args = script.Args(only=("printed.mcl",), runs=1, workers=workers)
+        assert script.run_pieces(script.PIECES, lab.Lab(), args, folder) == []
+    first, second = (lab.read(folder / "printed.mcl.json") for folder in folders)
+    for found in (first, second):
+        found["made"] = {name: found["made"][name] for name in ("config", "seed", "networks")}
+        del found["summary"]["ms_per_step"]
+    assert first == second and len(first["runs"]["steps"]) == 12
+
+
+def test_a_process_that_is_killed_is_told(monkeypatch, tmp_path, capsys):
+    import run as script
+
+    class Killed(script.ProcessPoolExecutor):
+        def submit(self, *words: Any) -> Any:
+            """In place of a job: a process that ends at once."""
+            return super().submit(os._exit, 1)
+
+    monkeypatch.setattr(script, "ProcessPoolExecutor", Killed)
+    piece = next(piece for piece in script.PIECES if piece.name == "printed")
+    failed = script.shared([(piece, "mcl"), (piece, "adam_dsom")], script.Args(), tmp_path)
+    assert sorted(failed) == ["printed.adam_dsom", "printed.mcl"]
+    assert capsys.readouterr().out.count("a process was killed") == 2
 
 
 def test_results_of_another_network_are_told(tmp_path, capsys):
@@ -307,11 +338,11 @@ def test_results_of_another_network_are_told(tmp_path, capsys):
         "made", comparison.Config(), lambda _: {"a": lambda _: {"value": 1.5}}, lambda _: {}, lambda _: ""
     )
     for some, told in ((lab.Lab(), "made.a: kept\n"), (lab.Lab(), "other settings or networks")):
-        script.run_piece(piece, lab.Lab(), script.Args(), tmp_path)
+        script.run_pieces([piece], lab.Lab(), script.Args(workers=1), tmp_path)
         capsys.readouterr()
         if "networks" in told:
             some.__dict__["origins"] = {"dsom": "0" * 12}
-        script.run_piece(piece, some, script.Args(), tmp_path)
+        script.run_pieces([piece], some, script.Args(workers=1), tmp_path)
         assert told in capsys.readouterr().out
 
 

@@ -156,4 +156,4 @@ Ablation (its Fig 5), and the filters and proposals of our own:
 
 ![Error over time](FIGURES/ablation_evolution.png)"""
 
-PIECE = Piece(NAME, Config(), jobs, figures, section)
+PIECE = Piece(NAME, Config(), jobs, figures, section, timed=True)

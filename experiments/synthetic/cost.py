@@ -177,4 +177,4 @@ SIZES = """\
 DSOM on a test map laid side by side. Memory is XLA's own account of arguments (weights and features of the map), result
 (PM) and temporary values of the compiled program."""
 
-PIECE = Piece(NAME, Config(), jobs, figures, section)
+PIECE = Piece(NAME, Config(), jobs, figures, section, timed=True)

@@ -57,11 +57,19 @@ class Lab:
         seed: of all randomness.
         sources: proposals that were made, by the name of the map.
         scenes: what PM is on a sequence, by proposal, exponent and sequence (:mod:`retention`).
+        piece: what runs at present.
     """
 
     seed: int = 0
     sources: dict[str, dict[str, Proposal]] = field(default_factory=dict)
     scenes: dict[tuple[str, float, int], Any] = field(default_factory=dict)
+    piece: str = ""
+
+    def enter(self, piece: str) -> None:
+        """Begin with a job of a piece: what was compiled for another will not be used again, and takes memory."""
+        if piece != self.piece:
+            jax.clear_caches()
+        self.piece = piece
 
     @cached_property
     def suite(self) -> Suite:
@@ -136,6 +144,7 @@ class Piece(NamedTuple):
         jobs: name -> what computes it, from the configuration.
         figures: by name, from the results of all pieces.
         section: markdown, from the results of all pieces.
+        timed: whether times of the jobs are shown, so that nothing may run beside them.
     """
 
     name: str
@@ -143,6 +152,7 @@ class Piece(NamedTuple):
     jobs: Callable[[Any], dict[str, Job]]
     figures: Callable[[Everything], dict[str, Figure]]
     section: Callable[[Everything], str]
+    timed: bool = False
 
 
 def scaled(config: C, runs: int) -> C:

@@ -1,22 +1,26 @@
 """The synthetic report: ``python experiments/synthetic/run.py [--only comparison ...] [--runs 100] [--force]``.
 
-From the networks in ``checkpoints``, on two cores in about an hour; ``--runs 20`` is a look at all of it in less.
-Every job writes ``results/PIECE.JOB.json``; what exists is kept, so that an interrupted run continues where it was, and
-a job that fails does not keep the others from being run. Figures (PNG and PDF) and ``experiments/REPORT.md`` are made
-from these files at the end.
+From the networks in ``checkpoints``, on two cores in three quarters of an hour; ``--runs 20`` is a look at all of it in
+less. What is timed has the machine for itself; after it, ``--workers`` processes share the rest. Every job writes
+``results/PIECE.JOB.json``; what exists is kept, so that an interrupted run continues where it was, and a job that fails
+does not keep the others from being run. Figures (PNG and PDF) and ``experiments/REPORT.md`` are made from these files
+at the end.
 """
 
 from __future__ import annotations
 
 import os
 import traceback
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass
+from functools import cache
+from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
 
 import comparison
 import cost
-import jax
 import multimodal
 import odometry
 import one_scan
@@ -24,7 +28,7 @@ import particles
 import printed
 import retention
 import write_report
-from lab import Job, Lab, Piece, measured, read, result_path, scaled, write
+from lab import Lab, Piece, measured, read, result_path, scaled, write
 
 from dsom_jax import report
 from dsom_jax.cli import parse
@@ -50,6 +54,8 @@ class Args:
     """Folder for results, figures and REPORT.md; default: this folder, and REPORT.md one above."""
     force: bool = False
     """Run again what exists."""
+    workers: int = 2
+    """Processes that share the jobs whose times are not shown; 1 takes one job after the other."""
 
 
 def main() -> None:
@@ -58,11 +64,7 @@ def main() -> None:
     check(args)
     out = report.output_folder(args.out or HERE)
     (out / "results").mkdir(exist_ok=True)
-    lab = Lab(args.seed)
-    failed = []
-    for piece in PIECES:
-        failed += run_piece(piece, lab, args, out / "results")
-        jax.clear_caches()  # Every filter compiles anew, and what is compiled takes memory.
+    failed = run_pieces(PIECES, lab_of(args.seed), args, out / "results")
     page = out / "REPORT.md" if args.out else HERE.parent / "REPORT.md"
     write_report.write(PIECES, out / "results", out / "figures", page)
     print(f"{os.path.relpath(page)}: written")
@@ -80,29 +82,75 @@ def check(args: Args) -> None:
         raise UserError(f"--only {unknown[0]}: no such piece; choose from {', '.join(p.name for p in PIECES)}")
     if not 1 <= args.runs <= 10_000:
         raise UserError(f"--runs {args.runs}: give at least 1 and at most 10000")
+    if not 1 <= args.workers <= 64:
+        raise UserError(f"--workers {args.workers}: give at least 1 and at most 64")
     if not 0 <= args.seed < 2**31:
         raise UserError(f"--seed {args.seed}: give 0 or more, and less than 2^31")
 
 
-def run_piece(piece: Piece, lab: Lab, args: Args, folder: Path) -> list[str]:
-    """Run the jobs of one piece that are asked for and missing; the names of those that failed."""
-    config, failed = scaled(piece.config, args.runs), []
-    for name, job in piece.jobs(config).items():
+@cache
+def lab_of(seed: int) -> Lab:
+    """The lab of this process, in which all of its jobs run."""
+    return Lab(seed)
+
+
+def run_pieces(pieces: Sequence[Piece], lab: Lab, args: Args, folder: Path) -> list[str]:
+    """Run what is asked for and missing; the names of the jobs that failed."""
+    missing = [(piece, name) for piece in pieces for name in wanted(piece, lab, args, folder)]
+    alone = [job for job in missing if args.workers == 1 or job[0].timed]
+    failed = [f"{piece.name}.{name}" for piece, name in alone if not run_job(piece, name, lab, args.runs, folder)]
+    return failed + shared([job for job in missing if job not in alone], args, folder)
+
+
+def wanted(piece: Piece, lab: Lab, args: Args, folder: Path) -> Iterator[str]:
+    """The jobs of a piece to be run; says of the others that they are kept."""
+    config = scaled(piece.config, args.runs)
+    for name in piece.jobs(config):
         full, path = f"{piece.name}.{name}", result_path(folder, piece.name, name)
         if args.only and not {piece.name, full} & set(args.only):
             continue
-        if path.exists() and not args.force:
-            made = read(path)["made"]
-            wanted = report.plain(asdict(config)), lab.seed, lab.origins
-            same = (made["config"], made["seed"], made.get("networks")) == wanted
-            print(f"{full}: kept" + ("" if same else ", made with other settings or networks (--force)"), flush=True)
-        elif not run_job(full, path, job, lab, config):
-            failed.append(full)
+        if args.force or not path.exists():
+            yield name
+            continue
+        made = read(path)["made"]
+        now = report.plain(asdict(config)), lab.seed, lab.origins
+        same = (made["config"], made["seed"], made.get("networks")) == now
+        print(f"{full}: kept" + ("" if same else ", made with other settings or networks (--force)"), flush=True)
+
+
+def shared(jobs: Sequence[tuple[Piece, str]], args: Args, folder: Path) -> list[str]:
+    """Run jobs in processes of their own, which give the numbers of one process; those that failed.
+
+    Not in threads: beside another computation in one process, some runs with DSOM and hybrid came out otherwise.
+    """
+    failed = []
+    with ProcessPoolExecutor(min(args.workers, len(jobs) or 1), get_context("spawn")) as pool:
+        names: dict[Future[bool], str] = {
+            pool.submit(in_worker, piece.name, name, args.seed, args.runs, folder): f"{piece.name}.{name}"
+            for piece, name in jobs
+        }
+        for done in as_completed(names):
+            try:
+                worked = done.result()
+            except BrokenProcessPool:
+                print(f"{names[done]}: failed: a process was killed; is there enough memory? (--workers 1)", flush=True)
+                worked = False
+            if not worked:
+                failed.append(names[done])
     return failed
 
 
-def run_job(full: str, path: Path, job: Job, lab: Lab, config: Any) -> bool:
+def in_worker(piece: str, job: str, seed: int, runs: int, folder: Path) -> bool:
+    """:func:`run_job` by name."""
+    (found,) = (p for p in PIECES if p.name == piece)
+    return run_job(found, job, lab_of(seed), runs, folder)
+
+
+def run_job(piece: Piece, name: str, lab: Lab, runs: int, folder: Path) -> bool:
     """Run one job and keep its numbers; False, and why on the terminal, if it failed."""
+    lab.enter(piece.name)
+    full, config = f"{piece.name}.{name}", scaled(piece.config, runs)
+    job = piece.jobs(config)[name]
     print(f"{full}: ...", flush=True)
     try:
         data = measured(job, lab, config)
@@ -113,7 +161,7 @@ def run_job(full: str, path: Path, job: Job, lab: Lab, config: Any) -> bool:
         traceback.print_exc()
         print(f"{full}: failed", flush=True)
         return False
-    write(path, data)
+    write(result_path(folder, piece.name, name), data)
     made = data["made"]
     print(f"{full}: {made['wall_s']:.0f} s, {made['processor_s']:.0f} s of processor time", flush=True)
     return True
