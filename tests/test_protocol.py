@@ -153,3 +153,6 @@ def test_training_is_called_with_words_that_it_knows(monkeypatch, tmp_path):
     (tmp_path / "net").mkdir()
     with pytest.raises(UserError, match="another map"):
         adapting.adapt(plan, tmp_path / "map.yaml", "b", start, lidar, tmp_path / "net")
+    (tmp_path / "net.json").unlink()
+    with pytest.raises(UserError, match="another map"):
+        adapting.adapt(plan, tmp_path / "map.yaml", "a", start, lidar, tmp_path / "net")

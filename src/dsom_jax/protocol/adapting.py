@@ -32,9 +32,9 @@ def settings(start: Path, lidar: LidarConfig, changes: dict[str, Any]) -> dict[s
 
 
 def check_begun(folder: Path, made_of: dict[str, str]) -> None:
-    """Note what a network is made of; UserError if the one in ``folder`` is of another map or start."""
+    """Note what a network is made of; UserError unless the one in ``folder``, if any, is of the same."""
     record = folder.with_suffix(".json")
-    if folder.exists() and record.is_file() and json.loads(record.read_text()) != made_of:
+    if folder.exists() and (json.loads(record.read_text()) if record.is_file() else None) != made_of:
         raise UserError(f"{folder}: was trained on another map, or from another network; delete it to train again")
     write_atomic(record, json.dumps(made_of).encode())
 
