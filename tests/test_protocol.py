@@ -14,15 +14,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dsom_jax import train
+from dsom_jax import report, train
 from dsom_jax.cli import parse
 from dsom_jax.data.suite import Suite
 from dsom_jax.episode import Episode
 from dsom_jax.errors import UserError
 from dsom_jax.filters.methods import DRAWN
 from dsom_jax.lidar import LidarConfig
+from dsom_jax.metrics import measure_errors, pool, summarize
 from dsom_jax.occupancy import from_cells
-from dsom_jax.protocol import adapting, clips, running
+from dsom_jax.protocol import adapting, clips, reporting, running
 from dsom_jax.protocol.plan import Plan, Variant, read_plan, variants
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -156,3 +157,43 @@ def test_training_is_called_with_words_that_it_knows(monkeypatch, tmp_path):
     (tmp_path / "net.json").unlink()
     with pytest.raises(UserError, match="another map"):
         adapting.adapt(plan, tmp_path / "map.yaml", "a", start, lidar, tmp_path / "net")
+
+
+def made_like(**changes: Any) -> dict[str, Any]:
+    """A result as far as comparisons ask for it."""
+    same = {"map_digest": "m", "clips_digest": "c", "seed": 0, "runs": 2, "particles": 9, "clips": 3, "updates": 8}
+    return same | {"each_run": {}, "network": None} | changes
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "alike"),
+    [
+        ({}, {}, True),
+        ({}, {"runs": 3}, False),
+        ({"clips_digest": "d"}, {}, False),
+        ({}, {"network": {"shipped": True, "digest": "s"}}, True),
+        ({"network": {"shipped": True, "digest": "s"}}, {"network": {"shipped": False, "digest": "a"}}, True),
+        ({"network": {"shipped": False, "digest": "a"}}, {"network": {"shipped": False, "digest": "a"}}, True),
+        ({"network": {"shipped": False, "digest": "b"}}, {"network": {"shipped": False, "digest": "a"}}, False),
+    ],
+)
+def test_only_what_was_made_alike_is_compared(one, other, alike):
+    a, b = Variant("adam_dsom", False, 0.6), Variant("adam_hybrid", False, 0.6)
+    assert reporting.comparable({a: made_like(**one), b: made_like(**other)}, a, b) == alike
+
+
+def test_results_without_their_runs_have_a_table_and_no_tests(tmp_path):
+    """As results were before they held their runs."""
+    (tmp_path / "hall").mkdir()
+    plan = Plan(methods=("mcl", "adam_likelihood_grid"), maps={"hall": {}})
+    phase = summarize(pool([measure_errors(np.full((2, 9), 0.1), np.zeros((2, 9)), np.zeros((2, 9)))]))
+    old = made_like(commit="c", map_kind="scanned", **dict.fromkeys(reporting.PHASES, phase))
+    del old["each_run"]
+    for variant in variants(plan):
+        report.write_json(tmp_path / "hall" / f"{variant.stem}.json", old)
+    reporting.write_report(plan, tmp_path)
+    text = (tmp_path / "REPORT.md").read_text()
+    assert text.count("| `mcl` |  |  | 2 | 100.0") == 2 and "Paired" not in text
+    (tmp_path / "hall" / "mcl.json").write_text("[]")
+    with pytest.raises(UserError, match=r"mcl\.json: not a result"):
+        reporting.write_report(plan, tmp_path)

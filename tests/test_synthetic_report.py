@@ -259,13 +259,17 @@ def test_typical_scans_are_medians():
 
 
 def test_numbers_survive_the_file(tmp_path):
-    table = join([run_rows("mcl", "global", 0, 0, made_runs(1, 3, 0.1))])
-    table.e_pos_m[0], table.retention[1] = np.inf, np.nan
+    phases = enumerate(("global", "kidnap"))
+    table = join([run_rows("mcl", phase, 3 + n, 1 - n, made_runs(n, 3, 0.1)) for n, phase in phases])
+    table.e_pos_m[0], table.e_theta_rad[1], table.retention[1], table.steps[2] = np.inf, np.inf, np.nan, -1
     lab.write(tmp_path / "x.json", {"runs": columns_of(table)})
     back = from_columns("mcl", lab.read(tmp_path / "x.json")["runs"])
-    np.testing.assert_allclose(back.e_pos_m, table.e_pos_m, rtol=1e-5)
-    np.testing.assert_allclose(back.retention, table.retention, rtol=1e-5)
-    np.testing.assert_array_equal(back.steps, table.steps)
+    for name, column, other in zip(RunTable._fields, table, back, strict=True):
+        assert other.dtype.kind == column.dtype.kind, name
+        if column.dtype.kind == "f":
+            np.testing.assert_allclose(other, column, rtol=1e-5)
+        else:
+            np.testing.assert_array_equal(other, column)
 
 
 def test_pieces_shrink_together():
@@ -304,31 +308,62 @@ def test_a_job_that_fails_stops_no_other(tmp_path, capsys):
 def test_processes_give_the_numbers_of_one(tmp_path):
     import run as script
 
-    folders = [tmp_path / "one", tmp_path / "two"]
-    for workers, folder in enumerate(folders, 1):
+    found = []
+    for workers in (1, 2):
+        folder = tmp_path / str(workers)
         folder.mkdir()
-        args = script.Args(only=("printed.mcl",), runs=1, workers=workers)
-        assert script.run_pieces(script.PIECES, lab.Lab(), args, folder) == []
-    first, second = (lab.read(folder / "printed.mcl.json") for folder in folders)
-    for found in (first, second):
-        found["made"] = {name: found["made"][name] for name in ("config", "seed", "networks")}
-        del found["summary"]["ms_per_step"]
-    assert first == second and len(first["runs"]["steps"]) == 12
+        args = script.Args(only=("printed.mcl", "printed.adam_dsom"), runs=1, workers=workers)
+        assert script.run_pieces(script.PIECES, lab.Lab(seed=1), args, folder) == []
+        results = {path.name: lab.read(path) for path in folder.iterdir()}
+        for result in results.values():
+            result["made"] = {name: result["made"][name] for name in ("config", "seed", "networks", "commit")}
+            del result["summary"]["ms_per_step"]
+        found.append(results)
+    assert found[0] == found[1] and len(found[0]) == 2
+    assert {(r["made"]["seed"], len(r["runs"]["steps"])) for r in found[0].values()} == {(1, 12)}
 
 
-def test_a_process_that_is_killed_is_told(monkeypatch, tmp_path, capsys):
+def dying(piece: str, job: str, *others: Any) -> bool:
+    """A job of a process that is killed, or one that is not."""
+    if job == "bad":
+        os._exit(1)
+    return job == "good"
+
+
+def test_a_process_that_is_killed_takes_no_other_job_with_it(monkeypatch, capsys):
     import run as script
 
-    class Killed(script.ProcessPoolExecutor):
-        def submit(self, *words: Any) -> Any:
-            """In place of a job: a process that ends at once."""
-            return super().submit(os._exit, 1)
+    monkeypatch.setattr(script, "in_worker", dying)
+    jobs = [("made", name, 0, 1, Path()) for name in ("bad", "good", "wrong", "good")]
+    assert script.shared(list(dict.fromkeys(jobs)), 2) == ["made.bad", "made.wrong"]
+    assert capsys.readouterr().out == "made.bad: failed: its process was killed; is there enough memory?\n"
+    assert script.shared([], 2) == []
 
-    monkeypatch.setattr(script, "ProcessPoolExecutor", Killed)
-    piece = next(piece for piece in script.PIECES if piece.name == "printed")
-    failed = script.shared([(piece, "mcl"), (piece, "adam_dsom")], script.Args(), tmp_path)
-    assert sorted(failed) == ["printed.adam_dsom", "printed.mcl"]
-    assert capsys.readouterr().out.count("a process was killed") == 2
+
+def test_what_is_timed_runs_alone(monkeypatch, tmp_path):
+    import run as script
+
+    here: list[str] = []
+    there: list[str] = []
+    monkeypatch.setattr(script, "run_job", lambda piece, name, *words: here.append(f"{piece.name}.{name}") or True)
+    monkeypatch.setattr(script, "shared", lambda jobs, workers: there.extend(f"{j[0]}.{j[1]}" for j in jobs) or [])
+    assert script.run_pieces(script.PIECES, lab.Lab(), script.Args(), tmp_path) == []
+    assert {name.split(".")[0] for name in here} == {"comparison", "cost"}
+    assert {name.split(".")[0] for name in here + there} == {piece.name for piece in script.PIECES}
+
+
+def test_curves_of_one_process_share_maps_and_proposals(monkeypatch):
+    import one_scan
+
+    beds: list[one_scan.Bed] = []
+    monkeypatch.setattr(one_scan.Bed, "point", lambda bed, condition, lab: beds.append(bed) or {})
+    jobs, some = one_scan.jobs(one_scan.Config()), lab.Lab()
+    for name in ("short", "scale"):
+        some.enter("one_scan")
+        jobs[name](some)
+    some.enter("retention")
+    jobs["scale"](some)
+    assert len(beds) == 14 and all(bed is beds[0] for bed in beds[:9]) and beds[0] is not beds[9]
 
 
 def test_results_of_another_network_are_told(tmp_path, capsys):

@@ -58,17 +58,22 @@ class Lab:
         sources: proposals that were made, by the name of the map.
         scenes: what PM is on a sequence, by proposal, exponent and sequence (:mod:`retention`).
         piece: what runs at present.
+        shared: what its jobs have in common, by configuration.
+        commit: of the code when this process began.
     """
 
     seed: int = 0
     sources: dict[str, dict[str, Proposal]] = field(default_factory=dict)
     scenes: dict[tuple[str, float, int], Any] = field(default_factory=dict)
     piece: str = ""
+    shared: dict[Any, Any] = field(default_factory=dict)
+    commit: str = field(default_factory=commit)
 
     def enter(self, piece: str) -> None:
-        """Begin with a job of a piece: what was compiled for another will not be used again, and takes memory."""
+        """Begin with a job of a piece: what was made for another will not be used again, and takes memory."""
         if piece != self.piece:
             jax.clear_caches()
+            self.shared.clear()
         self.piece = piece
 
     @cached_property
@@ -178,7 +183,7 @@ def measured(job: Job, lab: Lab, config: Any) -> dict[str, Any]:
         "config": asdict(config),
         "seed": lab.seed,
         "networks": lab.origins,
-        "commit": commit(),
+        "commit": lab.commit,
         "machine": machine(),
         "wall_s": time.perf_counter() - wall,
         "processor_s": time.process_time() - cpu,

@@ -75,9 +75,14 @@ class Config:
 
 
 def jobs(config: Config) -> dict[str, Any]:
-    """One for each curve; they share maps and proposals."""
-    bed = Bed(config)
-    return {name: partial(bed.curve, AXES[name]) for name in config.axes}
+    """One for each curve; those of one process share maps and proposals."""
+    return {name: partial(draw, AXES[name], config) for name in config.axes}
+
+
+def draw(axis: Axis, config: Config, lab: Lab) -> dict[str, Any]:
+    """Every point of a curve."""
+    bed: Bed = lab.shared.setdefault(config, Bed(config))
+    return bed.curve(axis, lab)
 
 
 class Bed:

@@ -12,8 +12,9 @@ from __future__ import annotations
 import os
 import traceback
 from collections.abc import Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import cache
 from multiprocessing import get_context
@@ -38,6 +39,9 @@ HERE = Path(__file__).resolve().parent
 PIECES: tuple[Piece, ...] = tuple(
     module.PIECE for module in (multimodal, comparison, printed, retention, particles, odometry, one_scan, cost)
 )
+
+Work = tuple[str, str, int, int, Path]
+"""A job for a process: piece, job, seed, runs, folder of the results."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +103,10 @@ def run_pieces(pieces: Sequence[Piece], lab: Lab, args: Args, folder: Path) -> l
     missing = [(piece, name) for piece in pieces for name in wanted(piece, lab, args, folder)]
     alone = [job for job in missing if args.workers == 1 or job[0].timed]
     failed = [f"{piece.name}.{name}" for piece, name in alone if not run_job(piece, name, lab, args.runs, folder)]
-    return failed + shared([job for job in missing if job not in alone], args, folder)
+    lab.enter("")
+    lab.sources.clear()
+    rest = [(piece.name, name, lab.seed, args.runs, folder) for piece, name in missing if (piece, name) not in alone]
+    return failed + shared(rest, args.workers)
 
 
 def wanted(piece: Piece, lab: Lab, args: Args, folder: Path) -> Iterator[str]:
@@ -118,32 +125,45 @@ def wanted(piece: Piece, lab: Lab, args: Args, folder: Path) -> Iterator[str]:
         print(f"{full}: kept" + ("" if same else ", made with other settings or networks (--force)"), flush=True)
 
 
-def shared(jobs: Sequence[tuple[Piece, str]], args: Args, folder: Path) -> list[str]:
-    """Run jobs in processes of their own, which give the numbers of one process; those that failed.
+def shared(jobs: Sequence[Work], workers: int) -> list[str]:
+    """Run jobs in processes of their own, which give the numbers of one process; the names of those that failed.
 
     Not in threads: beside another computation in one process, some runs with DSOM and hybrid came out otherwise.
     """
-    failed = []
-    with ProcessPoolExecutor(min(args.workers, len(jobs) or 1), get_context("spawn")) as pool:
-        names: dict[Future[bool], str] = {
-            pool.submit(in_worker, piece.name, name, args.seed, args.runs, folder): f"{piece.name}.{name}"
-            for piece, name in jobs
-        }
-        for done in as_completed(names):
-            try:
-                worked = done.result()
-            except BrokenProcessPool:
-                print(f"{names[done]}: failed: a process was killed; is there enough memory? (--workers 1)", flush=True)
-                worked = False
-            if not worked:
-                failed.append(names[done])
-    return failed
+    worked = together(jobs, workers)
+    for job in [job for job in jobs if worked[job] is None]:
+        # Whichever it was that had its process killed, the others are not concerned.
+        worked |= together([job], 1)
+    for job in [job for job in jobs if worked[job] is None]:
+        print(f"{job[0]}.{job[1]}: failed: its process was killed; is there enough memory?", flush=True)
+    return [f"{job[0]}.{job[1]}" for job in jobs if not worked[job]]
+
+
+def together(jobs: Sequence[Work], workers: int) -> dict[Work, bool | None]:
+    """Whether each job worked; None for those that were under way or waiting when a process was killed."""
+    worked: dict[Work, bool | None] = dict.fromkeys(jobs)
+    with ProcessPoolExecutor(max(1, min(workers, len(jobs))), get_context("spawn")) as pool:
+        try:
+            futures = {}
+            for job in jobs:
+                with suppress(BrokenProcessPool):
+                    futures[pool.submit(in_worker, *job)] = job
+            for done in as_completed(futures):
+                with suppress(BrokenProcessPool):
+                    worked[futures[done]] = done.result()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    return worked
 
 
 def in_worker(piece: str, job: str, seed: int, runs: int, folder: Path) -> bool:
     """:func:`run_job` by name."""
     (found,) = (p for p in PIECES if p.name == piece)
-    return run_job(found, job, lab_of(seed), runs, folder)
+    try:
+        return run_job(found, job, lab_of(seed), runs, folder)
+    except KeyboardInterrupt:
+        os._exit(130)  # An exception would be handed back, and the next job begun.
 
 
 def run_job(piece: Piece, name: str, lab: Lab, runs: int, folder: Path) -> bool:
@@ -154,6 +174,7 @@ def run_job(piece: Piece, name: str, lab: Lab, runs: int, folder: Path) -> bool:
     print(f"{full}: ...", flush=True)
     try:
         data = measured(job, lab, config)
+        write(result_path(folder, piece.name, name), data)
     except UserError as error:
         print(f"{full}: failed: {error}", flush=True)
         return False
@@ -161,7 +182,6 @@ def run_job(piece: Piece, name: str, lab: Lab, runs: int, folder: Path) -> bool:
         traceback.print_exc()
         print(f"{full}: failed", flush=True)
         return False
-    write(result_path(folder, piece.name, name), data)
     made = data["made"]
     print(f"{full}: {made['wall_s']:.0f} s, {made['processor_s']:.0f} s of processor time", flush=True)
     return True

@@ -35,7 +35,8 @@ def check_begun(folder: Path, made_of: dict[str, str]) -> None:
     """Note what a network is made of; UserError unless the one in ``folder``, if any, is of the same."""
     record = folder.with_suffix(".json")
     if folder.exists() and (json.loads(record.read_text()) if record.is_file() else None) != made_of:
-        raise UserError(f"{folder}: was trained on another map, or from another network; delete it to train again")
+        why = f"trained on another map, or from another network, or {record.name} beside it is lost"
+        raise UserError(f"{folder}: {why}; delete it to train again")
     write_atomic(record, json.dumps(made_of).encode())
 
 

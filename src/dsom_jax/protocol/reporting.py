@@ -15,7 +15,18 @@ from dsom_jax.protocol.running import read_entry
 from dsom_jax.run_table import RunTable, from_columns, join, paired
 from dsom_jax.statistics import Evidence, corrected, rate_evidence, value_evidence
 
-COLUMNS = ("method", "network", "T_cut", "converged %", "steps", "E_pos m", "kept %", "strict %", "sure and wrong %")
+COLUMNS = (
+    "method",
+    "network",
+    "T_cut",
+    "runs",
+    "converged %",
+    "steps",
+    "E_pos m",
+    "kept %",
+    "strict %",
+    "sure and wrong %",
+)
 PHASES = {"global": "Global localization", "kidnap": "Spliced kidnapping"}
 LEGEND = """\
 Every clip starts without any prior on the pose; at its end the robot is carried to the start of the next one unnoticed.
@@ -71,7 +82,7 @@ def row(variant: Variant, origin: str, m: dict[str, Any]) -> tuple[str, ...]:
     """Cells of one variant, ``origin`` that of its network."""
     return (
         f"`{variant.method}`", origin, "" if variant.t_cut is None else f"{variant.t_cut:g}",
-        rate(m, "converged"), number(m["steps_median"], "{:g}"),
+        f"{m['experiments']}", rate(m, "converged"), number(m["steps_median"], "{:g}"),
         number(m["e_pos_m"], "{:.3f}") + interval(m["e_pos_ci95"], "{:.3f}", 1),
         rate(m, "retention"), number(m["strict_success"], "{:.1f}", 100), number(m["false_confident"], "{:.1f}", 100),
     )  # fmt: skip
@@ -124,10 +135,13 @@ def pairs(entries: dict[Variant, dict[str, Any]]) -> Iterator[tuple[Variant, Var
 
 
 def comparable(entries: dict[Variant, dict[str, Any]], variant: Variant, other: Variant) -> bool:
-    """Whether both have every run, of the same map, clips, seed and number of runs."""
+    """Whether both have every run, of the same map, clips, seed, runs and particles, and of one adapted network."""
     sides = [entries[variant], entries[other]]
-    same = ("map_digest", "clips_digest", "seed", "runs")
-    return all("each_run" in side for side in sides) and all(sides[0][key] == sides[1][key] for key in same)
+    if not all("each_run" in side for side in sides):
+        return False
+    adapted = {side["network"]["digest"] for side in sides if side["network"] and not side["network"]["shipped"]}
+    same = ("map_digest", "clips_digest", "seed", "runs", "particles", "clips", "updates")
+    return len(adapted) < 2 and all(sides[0][key] == sides[1][key] for key in same)
 
 
 def runs_of(variant: Variant, entry: dict[str, Any]) -> RunTable:
@@ -137,7 +151,8 @@ def runs_of(variant: Variant, entry: dict[str, Any]) -> RunTable:
 
 def tests(plan: Plan, entries: dict[Variant, dict[str, Any]]) -> str:
     """Paired comparisons of both phases, corrected as one family."""
-    found = [(a, b) for a, b in pairs(entries) if comparable(entries, a, b)]
+    asked = list(pairs(entries))
+    found = [(a, b) for a, b in asked if comparable(entries, a, b)]
     if not found:
         return ""
     evidence: list[Evidence] = []
@@ -151,6 +166,8 @@ def tests(plan: Plan, entries: dict[Variant, dict[str, Any]]) -> str:
         f"Paired tests: same clips, same seeds. Intervals draw clips first, and {plan.clips} clips are few; "
         "p is McNemar's for rates and Wilcoxon's for errors, corrected for all rows of this map."
     )
+    if len(found) < len(asked):
+        note += f" {len(asked) - len(found)} pairs were not made alike and are left out."
     return "\n".join([note, "", *lines]) + "\n"
 
 
@@ -176,11 +193,12 @@ def figures(plan: Plan, out: Path, entries: dict[Variant, dict[str, Any]]) -> No
     """Error over the updates with its 95 % band, as in the paper's figures of real data; boxes of final errors."""
     runs = {v: runs_of(v, entry) for v, entry in entries.items() if "each_run" in entry}
     shown = [v for v in runs if v.name in (plan.shown or plan.methods) and v.t_cut in (None, plan.t_cuts[0])]
+    shown = [v for v in shown if comparable(entries, shown[0], v)]
     if not shown:
         return
     clips = range(len(entries[shown[0]]["evolution"]))
     bands = [{v.name: entries[v]["evolution"][clip] for v in shown} for clip in clips]
-    evolution = plotting.band_evolution(bands, [[plan.updates]] * len(bands))
+    evolution = plotting.band_evolution(bands, [[entries[shown[0]]["updates"]]] * len(bands))
     boxes = plotting.error_boxes({phase: {v.name: final(runs[v], phase) for v in shown} for phase in PHASES})
     for name, figure in (("error_evolution", evolution), ("position_error", boxes)):
         for ending in ("png", "pdf"):

@@ -33,6 +33,7 @@ class Builder:
     def __init__(self, plan: Plan, suite: Suite, networks: Networks) -> None:
         self.plan, self.suite, self.networks = plan, suite, networks
         self.made: dict[Path | None, dict[str, Proposal]] = {}
+        self.commit = commit()
 
     def __call__(self, variant: Variant, grid: OccupancyGrid, episode: Episode) -> Filter:
         plan, lidar = self.plan, self.suite.lidar
@@ -65,7 +66,7 @@ def run_variant(
         "each_run": report.rounded(columns_of(record.table)),
         "evolution": report.rounded([plotting.band_of(trace) for trace in record.traces]),
     }
-    facts = {"variant": variant.name, "t_cut": variant.t_cut, **made_of, "commit": commit()}
+    facts = {"variant": variant.name, "t_cut": variant.t_cut, **made_of, "commit": build.commit}
     facts["network"] = network_facts(build.networks(variant), variant)
     report.write_rows(out / f"{variant.stem}.json", facts | entry)
 
@@ -79,6 +80,7 @@ def network_facts(folder: Path | None, variant: Variant) -> dict[str, Any] | Non
     shipped = folder == checkpoint.shipped(kind)
     return {
         "shipped": shipped,
+        "digest": checkpoint.digest(folder),
         **{name: record.get(name) for name in ("data", "steps", "samples", "seconds", "commit")},
     }
 
@@ -107,9 +109,11 @@ def read_entry(out: Path, variant: Variant) -> dict[str, Any] | None:
     if not path.is_file():
         return None
     try:
-        found: dict[str, Any] = json.loads(path.read_text())
+        found = json.loads(path.read_text())
     except ValueError as error:
         raise UserError(f"{path}: not JSON ({error}); delete it to have it made again") from None
+    if not isinstance(found, dict):
+        raise UserError(f"{path}: not a result; delete it to have it made again")
     return found
 
 
