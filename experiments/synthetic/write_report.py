@@ -91,7 +91,12 @@ def provenance(everything: Everything) -> str:
                       _all(m["commit"][:7] for m in made)])  # fmt: skip
     head = ("piece", "jobs", "min by the clock", "min of processor time", "load, at most", "seed", "commit")
     machines = {_machine(entry["made"]["machine"]) for jobs in everything.values() for entry in jobs.values()}
-    return "\n\n".join([markdown(head, lines), *sorted(machines)])
+    return "\n\n".join([markdown(head, lines), OVERLAP, *sorted(machines)])
+
+
+OVERLAP = """\
+Jobs of comparison and cost run alone. Those of the other pieces share the machine with each other (`--workers`), so
+that their minutes overlap."""
 
 
 def _all(values: Any) -> str:
