@@ -139,7 +139,7 @@ def comparable(entries: dict[Variant, dict[str, Any]], variant: Variant, other: 
     sides = [entries[variant], entries[other]]
     if not all("each_run" in side for side in sides):
         return False
-    adapted = {side["network"]["digest"] for side in sides if side["network"] and not side["network"]["shipped"]}
+    adapted = {side["network"].get("digest") for side in sides if side["network"] and not side["network"]["shipped"]}
     same = ("map_digest", "clips_digest", "seed", "runs", "particles", "clips", "updates")
     return len(adapted) < 2 and all(sides[0][key] == sides[1][key] for key in same)
 
