@@ -15,9 +15,10 @@ from dsom_jax.atomic import write_atomic
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write PNG at 150 dpi or PDF, as the ending of ``path`` says, whole or not at all."""
+    """Write PNG at 150 dpi or PDF, as the ending of ``path`` says, whole or not at all, without a date."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format=path.suffix[1:], dpi=150)
+    undated = {"CreationDate": None} if path.suffix == ".pdf" else None
+    figure.savefig(buffer, format=path.suffix[1:], dpi=150, metadata=undated)
     write_atomic(path, buffer.getvalue())
 
 
