@@ -167,7 +167,7 @@ def tests(plan: Plan, entries: dict[Variant, dict[str, Any]]) -> str:
         "p is McNemar's for rates and Wilcoxon's for errors, corrected for all rows of this map."
     )
     if len(found) < len(asked):
-        note += f" {len(asked) - len(found)} pairs were not made alike and are left out."
+        note += f" Pairs that were not made alike are left out: {len(asked) - len(found)}."
     return "\n".join([note, "", *lines]) + "\n"
 
 
