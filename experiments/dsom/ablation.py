@@ -36,7 +36,7 @@ class Args:
 
 
 def main() -> None:
-    """Rows one after another; a table at the end."""
+    """Rows one after another, each printed as it comes."""
     args = parse(Args, "python experiments/dsom/ablation.py")
     given = read_yaml(args.config, "ablation")
     report.output_folder(args.out.parent)
