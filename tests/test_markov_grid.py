@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 import tiny_world
+from dsom_jax.filters.adam import AdamRecalling
 from dsom_jax.filters.adam_memory import AdamMemory
 from dsom_jax.filters.adam_robust import AdamRobust, RobustConfig, RobustState
-from dsom_jax.filters.methods import Settings, make_filter
+from dsom_jax.filters.methods import Settings, build_filter, make_filter
 from dsom_jax.geometry import compose, inverse, wrap_angle
 from dsom_jax.montecarlo import run, run_keys
 from dsom_jax.motion import OdometryMotion
@@ -246,3 +247,29 @@ def test_a_filter_outlives_odometry_that_is_no_number(filters):
     info = run(filters[0], spoilt, run_keys(3, 0, 6)).info
     off = np.asarray(info.cluster) - np.asarray(episode.poses)
     assert (np.hypot(off[..., 0], off[..., 1])[:, -5:] < 0.5).all()
+
+
+def test_alg_1_redraws_from_all_scans_so_far(memory):
+    """A scan that says nothing: without trust in any particle, all come from what the drive has told."""
+    episode = tiny_world.drive()
+    filter = make_filter("adam", memory, tiny_world.grid(), LIDAR, Settings(particles=60))
+    assert isinstance(filter, AdamRecalling)
+    recall, belief = jax.jit(filter.recall), filter.begin()
+    for t in range(len(episode.ranges)):
+        _, belief = recall(belief, jax.tree.map(lambda leaf, t=t: leaf[t], episode.inputs))
+    blind = Inputs(jnp.full(LIDAR.beams, jnp.nan), jnp.zeros(3), jnp.int32(len(episode.ranges)))
+    state = filter.init(jax.random.key(0))
+    lost = state._replace(weights=jnp.zeros(60).at[0].set(1e-6), updates=jnp.int32(9))
+    poses = filter.step(jax.random.key(1), lost, blind, recall(belief, blind)[0])[0].poses
+    off = np.asarray(poses - episode.poses[-1])
+    assert (np.hypot(off[:, 0], off[:, 1]) < 0.5).mean() > 0.9
+    with pytest.raises(TypeError, match="AdamRecalling: the proposal has a past"):
+        filter.prepare(blind)
+
+
+def test_methods_with_the_memory_are_offered(memory):
+    made = {"likelihood_grid": memory.likelihood}
+    for name, kind in (("adam_markov_grid", AdamRecalling), ("robust_markov_grid", AdamMemory)):
+        own = {"particles": 20, "t_cut": 0.6, "sources": made}
+        built = build_filter(name, tiny_world.grid(), LIDAR, **own)
+        assert isinstance(built, kind) and built.proposal.likelihood.expected is memory.likelihood.expected

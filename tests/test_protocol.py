@@ -13,13 +13,14 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import yaml
 
-from dsom_jax import report, train
+from dsom_jax import checkpoint, report, train, train_filter
 from dsom_jax.cli import parse
 from dsom_jax.data.suite import Suite
 from dsom_jax.episode import Episode
 from dsom_jax.errors import UserError
-from dsom_jax.filters.methods import DRAWN
+from dsom_jax.filters.methods import DRAWN, LEARNED
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.metrics import measure_errors, pool, summarize
 from dsom_jax.occupancy import from_cells
@@ -72,8 +73,10 @@ def test_t_cut_is_alg_1s_alone():
 
 
 def test_a_map_replaces_what_it_names():
-    plan = Plan(maps={"a": {"yaml": "a.yaml", "logs": ["x.log"], "adapt": {"seed": 3}}, "b": {"yaml": "b.yaml"}},
-                logs=("all.log",), adapt={"seed": 1, "warmup": 5})  # fmt: skip
+    own = {"learn": {"data": {"removed": 9}}}
+    plan = Plan(maps={"a": {"yaml": "a.yaml", "logs": ["x.log"], "adapt": {"seed": 3}}, "b": {"yaml": "b.yaml", **own}},
+                logs=("all.log",), adapt={"seed": 1, "warmup": 5}, learn={"data": {"short": 0.1}})  # fmt: skip
+    assert plan.on("b")[0].learn == {"data": {"short": 0.1, "removed": 9}} and plan.on("a")[0].learn == plan.learn
     own, fields = plan.on("a")
     assert (own.logs, own.adapt, fields) == (("x.log",), {"seed": 3, "warmup": 5}, {"yaml": "a.yaml"})
     assert plan.on("b")[0].logs == ("all.log",) and plan.on("b")[0].adapt == plan.adapt
@@ -137,26 +140,48 @@ def test_training_is_called_with_words_that_it_knows(monkeypatch, tmp_path):
     monkeypatch.setattr(adapting.subprocess, "run", lambda words: called.append(words) or SimpleNamespace(returncode=0))
     start, lidar = ROOT / "checkpoints" / "dsom", LidarConfig(180, -math.pi / 2, math.pi / 180)
     plan = Plan(adapt_minutes=12.0, adapt={"learning_rate": 1e-4, "scan": {"removed": [0, 9]}})
-    folder = adapting.adapt(plan, tmp_path / "map.yaml", "a", start, lidar, tmp_path / "net")
+    site = adapting.Site(tmp_path / "map.yaml", "a", lidar, tmp_path / "net")
+    folder = adapting.adapt(plan, site, start)
     monkeypatch.setattr(sys, "argv", called[0][2:])
     arguments = parse(train.Arguments, "python -m dsom_jax.train")
-    assert folder == arguments.out == tmp_path / "net" and arguments.init == start
+    assert folder == arguments.out == tmp_path / "net-12-min" and arguments.init == start
     assert arguments.maps == (tmp_path / "map.yaml",) and arguments.minutes == 12.0
     config = train.read_config(arguments.config)
     assert config.scan.fov_min == config.scan.fov_max == config.model.fov_min == pytest.approx(math.pi)
     assert (config.learning_rate, config.scan.removed, config.maps_share) == (1e-4, (0, 9), 1.0)
     # It continues what is shipped, and takes its scans from the lidar.
-    assert train.load_init(start, config) is not None and config.model.misfit(lidar) is None
-    assert adapting.adapt(replace(plan, adapt_minutes=0.0), Path("m"), "a", start, lidar, tmp_path) == start
+    assert train.load_init(start, config.model) is not None and config.model.misfit(lidar) is None
+    assert adapting.adapt(replace(plan, adapt_minutes=0.0), site, start) == start
     monkeypatch.setattr(adapting.subprocess, "run", lambda words: SimpleNamespace(returncode=2))
     with pytest.raises(UserError, match=r"training on map.yaml failed"):
-        adapting.adapt(plan, tmp_path / "map.yaml", "a", start, lidar, tmp_path / "net")
-    (tmp_path / "net").mkdir()
+        adapting.adapt(plan, site, start)
+    folder.mkdir()
     with pytest.raises(UserError, match="another map"):
-        adapting.adapt(plan, tmp_path / "map.yaml", "b", start, lidar, tmp_path / "net")
-    (tmp_path / "net.json").unlink()
+        adapting.adapt(plan, site._replace(map_digest="b"), start)
+    folder.with_suffix(".json").unlink()
     with pytest.raises(UserError, match="another map"):
-        adapting.adapt(plan, tmp_path / "map.yaml", "a", start, lidar, tmp_path / "net")
+        adapting.adapt(plan, site, start)
+
+
+@pytest.mark.parametrize("kind", LEARNED)
+def test_filters_are_trained_on_with_words_that_their_training_knows(kind, monkeypatch, tmp_path):
+    called: list[list[str]] = []
+    monkeypatch.setattr(adapting.subprocess, "run", lambda words: called.append(words) or SimpleNamespace(returncode=0))
+    start, lidar = ROOT / "checkpoints" / kind.replace("_", "-"), LidarConfig(361, -math.pi / 2, math.pi / 360)
+    plan = Plan(learn_steps=7, learn={"warmup": 2, "data": {"removed": 9, "drive": {"update_min_d": 0.25}}})
+    site = adapting.Site(tmp_path / "map.yaml", "a", lidar, tmp_path / "net")
+    folder = adapting.adapt_filter(plan, site, start, kind)
+    monkeypatch.setattr(sys, "argv", called[0][2:])
+    arguments = parse(train_filter.Arguments, "python -m dsom_jax.train_filter")
+    assert (arguments.filter, arguments.init, arguments.steps, arguments.resume) == (kind, start, 7, True)
+    assert folder == arguments.out == tmp_path / f"net-{kind}-7-steps" and arguments.maps == (tmp_path / "map.yaml",)
+    config = arguments.read_config(yaml.safe_load(arguments.config.read_text()), "c.yaml")
+    assert (config.warmup, config.data.removed, config.data.drive.update_min_d) == (2, 9, 0.25)
+    # Half a turn in 361 beams, of which the network wants at most 120; all else is the drive's and the network's own.
+    assert config.data.lidar == lidar and config.data.beam_step == 4 and config.data.drive.lidar == LidarConfig()
+    assert config.model.misfit(lidar) is None and train.load_init(start, config.model, kind) is not None
+    assert checkpoint.load(start, kind=kind).config.misfit(lidar) is not None
+    assert adapting.adapt_filter(replace(plan, learn_steps=0), site, start, kind) == start
 
 
 def made_like(**changes: Any) -> dict[str, Any]:
@@ -180,6 +205,13 @@ def made_like(**changes: Any) -> dict[str, Any]:
 def test_only_what_was_made_alike_is_compared(one, other, alike):
     a, b = Variant("adam_dsom", False, 0.6), Variant("adam_hybrid", False, 0.6)
     assert reporting.comparable({a: made_like(**one), b: made_like(**other)}, a, b) == alike
+
+
+def test_networks_of_two_kinds_need_not_be_one():
+    sides = {
+        Variant(name, False): made_like(network={"shipped": False, "digest": name}) for name in ("pf_net", "adam_dsom")
+    }
+    assert reporting.comparable(sides, *sides)
 
 
 def test_results_without_their_runs_have_a_table_and_no_tests(tmp_path):

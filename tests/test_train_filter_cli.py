@@ -5,21 +5,27 @@ from __future__ import annotations
 import json
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import yaml
+from flax import nnx
 
 import dsom_jax
 import tiny_world
 from dsom_jax import checkpoint, train_filter
 from dsom_jax.errors import UserError, run_cli
+from dsom_jax.nn import create_pfrnn
 from dsom_jax.training import filter_evaluation
 from dsom_jax.training.sequences import Window
 from learned_kit import training
+
+ROOT = Path(__file__).resolve().parents[1]
 
 
 @pytest.fixture(scope="module")
@@ -52,9 +58,9 @@ def weights(folder: Path) -> bytes:
 def test_a_run_that_lost_its_end_resumes_bit_for_bit(files, monkeypatch):
     made, parts = [], train_filter.parts
 
-    def compiled_once(run, grids):
-        made.append(made[0] if made else parts(run, grids))
-        return made[0]._replace(state=train_filter.first_state(run))
+    def compiled_once(run, material):
+        made.append(made[0] if made else parts(run, material))
+        return made[0]._replace(state=train_filter.first_state(run, material.network))
 
     def blank_windows(key, pool, config, resolution, count, strays):
         """Robots that stand at the start of their paths and see nothing: no scans to compile."""
@@ -79,6 +85,25 @@ def test_a_run_that_lost_its_end_resumes_bit_for_bit(files, monkeypatch):
     assert [{k: v for k, v in json.loads(line).items() if k != "seconds"} for line in again] == numbers
 
 
+def test_a_run_begins_with_the_weights_that_are_named(files, capsys):
+    begin = files / "begin"
+    given = train_filter.Arguments("pfrnn", files / "tiny.yaml", (files / "map.yaml",), out=files / "more", resume=True)
+    config = given.read_config(yaml.safe_load((files / "tiny.yaml").read_text()), "tiny.yaml")
+    network = create_pfrnn(config.model, 7)
+    checkpoint.save(begin, network, {})
+    run, material = train_filter.open_run(replace(given, init=begin))
+    state = train_filter.first_state(run, material.network)
+    for part in (state.params, state.average):
+        chex.assert_trees_all_equal(part, nnx.as_pure(nnx.split(network)[1]))
+    with pytest.raises(UserError, match="give --init, too"):
+        train_filter.open_run(given)
+    with pytest.raises(UserError, match="began with begin"):
+        train_filter.open_run(replace(given, init=files))
+    run.save(state, {})
+    assert train_filter.open_run(replace(given, init=begin))[1].network is None
+    assert "not read, the run goes on" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -86,6 +111,9 @@ def test_a_run_that_lost_its_end_resumes_bit_for_bit(files, monkeypatch):
         (("--filter", "magic"), "filter"),
         (("--maps", "nowhere.yaml"), "nowhere.yaml"),
         (("--config", "nowhere.yaml"), "nowhere.yaml"),
+        (("--init", "nowhere"), "nowhere"),
+        (("--init", str(ROOT / "checkpoints" / "dsom")), "a pfrnn is needed"),
+        (("--init", str(ROOT / "checkpoints" / "pfrnn")), "cells = 16, the run's is 8"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(files, monkeypatch, capsys, words, message):

@@ -150,6 +150,35 @@ def reopen(
     return run
 
 
+def check_init(init: Path | None, run: Run, path: Path) -> None:
+    """UserError for another ``--init`` than the run's, or none where it is still needed; says if it is not read."""
+    if init is not None and init.name != run.init:
+        raise UserError(f"--init {init}: the run in {path} began with {run.init or 'fresh weights'}; resume without it")
+    if init is None and run.init is not None and not run.states():
+        raise UserError(f"{path}: the run begins with {run.init} and has saved no state yet; give --init, too")
+    if init is not None and run.states():
+        print(f"--init {init}: not read, the run goes on from {run.states()[-1]}")
+
+
+def load_init(path: Path | None, wanted: Any, kind: str = "dsom") -> Any:
+    """The network to start from, if one is named; it must be of the run's configuration ``wanted``."""
+    if path is None:
+        return None
+    model = checkpoint.load(path, kind=kind)
+    own, run = flat(asdict(model.config)), flat(asdict(wanted))
+    unlike = ", ".join(f"{name} = {own[name]!r}, the run's is {run[name]!r}" for name in own if own[name] != run[name])
+    if unlike:
+        raise UserError(f"{path}: field model: {unlike}; give a --config with the network's own, or another --init")
+    return model
+
+
+def flat(fields: dict[str, Any]) -> dict[str, Any]:
+    """Fields of a network's configuration by name, without the scans it was trained for: they are no part of it."""
+    inner = {name: value for part in fields.values() if isinstance(part, dict) for name, value in part.items()}
+    outer = {name: value for name, value in fields.items() if not isinstance(value, dict)}
+    return {name: value for name, value in (outer | inner).items() if name not in ("fov_min", "reach_min")}
+
+
 def commit() -> str:
     """Commit of the source, or unknown."""
     command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]

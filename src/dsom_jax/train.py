@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,7 +14,7 @@ from dsom_jax.data.open_map import load_maps
 from dsom_jax.errors import UserError, run_cli
 from dsom_jax.nn import DSOM
 from dsom_jax.occupancy import OccupancyGrid
-from dsom_jax.run_folder import Run, check_new, create, read_fields, reopen
+from dsom_jax.run_folder import Run, check_init, check_new, create, load_init, read_fields, reopen
 from dsom_jax.trainer import Parts, check_length, train
 from dsom_jax.training.batches import make_batch, plain
 from dsom_jax.training.evaluation import make_evaluation
@@ -90,7 +90,7 @@ def open_run(args: Arguments) -> tuple[Run, Material]:
 
 def read_material(args: Arguments, run: Run) -> Material:
     """Maps and network; a run that has saved a state no longer needs the network that it began with."""
-    network = None if run.states() else load_init(args.init, run.config)
+    network = None if run.states() else load_init(args.init, run.config.model)
     # Procedural buildings have the network's scale, and so do maps that are mixed with them.
     alone = run.config.maps_share == 1.0
     return Material(load_maps(tuple(map(Path, run.maps)), run.config.model.resolution, alone), network)
@@ -105,35 +105,11 @@ def resume_run(args: Arguments, path: Path) -> Run:
     return run
 
 
-def check_init(init: Path | None, run: Run, path: Path) -> None:
-    """UserError for another ``--init`` than the run's, or none where it is still needed; says if it is not read."""
-    if init is not None and init.name != run.init:
-        raise UserError(f"--init {init}: the run in {path} began with {run.init or 'fresh weights'}; resume without it")
-    if init is None and run.init is not None and not run.states():
-        raise UserError(f"{path}: the run begins with {run.init} and has saved no state yet; give --init, too")
-    if init is not None and run.states():
-        print(f"--init {init}: not read, the run goes on from {run.states()[-1]}")
-
-
 def first_state(run: Run, network: DSOM | None) -> TrainState:
     """The newest saved state, or a fresh one."""
     if run.states():
         return checkpoint.load_state(run.states()[-1], init_state(run.config))
     return init_state(run.config, network)
-
-
-def load_init(path: Path | None, config: TrainConfig) -> DSOM | None:
-    """The network to start from, if one is named; it must be of the run's configuration."""
-    if path is None:
-        return None
-    model: DSOM = checkpoint.load(path)
-    # What scans it was trained for is no part of its structure: the run trains it for those that it draws.
-    names = [f.name for f in fields(config.model) if f.name not in ("fov_min", "reach_min")]
-    pairs = [(name, getattr(model.config, name), getattr(config.model, name)) for name in names]
-    unlike = ", ".join(f"{name} = {own!r}, the run's is {wanted!r}" for name, own, wanted in pairs if own != wanted)
-    if unlike:
-        raise UserError(f"{path}: field model: {unlike}; give a --config with the network's own, or another --init")
-    return model
 
 
 def held_out(run: Run, grids: list[OccupancyGrid]) -> Any:

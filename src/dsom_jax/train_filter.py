@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ from dsom_jax.data.suite import load_suite
 from dsom_jax.errors import UserError, run_cli
 from dsom_jax.nn import KINDS
 from dsom_jax.occupancy import OccupancyGrid
-from dsom_jax.run_folder import FilterRun, Run, check_new, create, read_fields, reopen
+from dsom_jax.run_folder import FilterRun, Run, check_init, check_new, create, load_init, read_fields, reopen
 from dsom_jax.trainer import Parts, check_length, train
 from dsom_jax.training.filter_evaluation import make_tracking
 from dsom_jax.training.filter_loop import FilterTrainConfig, init_filter_state, make_filter_step, stack_maps
@@ -34,6 +34,7 @@ class Arguments:
         filter: which of the two.
         config: YAML file with fields of FilterTrainConfig that differ from the defaults.
         maps: map.yaml files to train in; default: the two test maps of synthetic-v1, as the paper trains its baselines.
+        init: checkpoint whose weights to start from.
         minutes: time to train; the number of steps is set after the first few.
         steps: number of steps, in place of minutes.
         out: folder for the checkpoint, the training state and metrics.jsonl; default: runs/ and the filter's name.
@@ -45,6 +46,7 @@ class Arguments:
     filter: Literal["pf_net", "pfrnn"]
     config: Path | None = None
     maps: tuple[Path, ...] = ()
+    init: Path | None = None
     minutes: float = 20.0
     steps: int | None = None
     out: Path | None = None
@@ -73,19 +75,33 @@ def training_maps(paths: tuple[str, ...], resolution: float) -> list[OccupancyGr
     return list(tests.values())
 
 
-def open_run(args: Arguments) -> tuple[FilterRun, list[OccupancyGrid]]:
-    """A new run in an empty folder, or the one to resume, and the maps it is trained on."""
+class Material(NamedTuple):
+    """What a run reads before it begins: maps at the network's resolution, and the network to start from, if any."""
+
+    grids: list[OccupancyGrid]
+    network: Any
+
+
+def open_run(args: Arguments) -> tuple[FilterRun, Material]:
+    """A new run in an empty folder, or the one to resume, and what it is made of."""
     path, out = args.folder / "run.json", args.folder
     if args.resume and path.exists():
         run = resume_run(args, path)
-        return run, training_maps(run.maps, run.config.model.resolution)
+        return run, read_material(args, run)
     check_new(out, args.resume)
     config = args.read_config(read_fields(args.config), str(args.config))
-    run = FilterRun(out, config, tuple(str(p) for p in args.maps), args.steps)
-    # Before anything is written: a bad map leaves no folder behind.
-    grids = training_maps(run.maps, config.model.resolution)
+    begin = None if args.init is None else args.init.name
+    run = FilterRun(out, config, tuple(str(p) for p in args.maps), args.steps, init=begin)
+    # Before anything is written: a bad map or checkpoint leaves no folder behind.
+    material = read_material(args, run)
     create(run)
-    return run, grids
+    return run, material
+
+
+def read_material(args: Arguments, run: FilterRun) -> Material:
+    """Maps and network; a run that has saved a state no longer needs the network that it began with."""
+    network = None if run.states() else load_init(args.init, run.config.model, args.filter)
+    return Material(training_maps(run.maps, run.config.model.resolution), network)
 
 
 def resume_run(args: Arguments, path: Path) -> FilterRun:
@@ -93,12 +109,13 @@ def resume_run(args: Arguments, path: Path) -> FilterRun:
     run = reopen(FilterRun, path, lambda given: args.read_config(given, str(path)), args.maps, args.steps)
     if args.config is not None and args.read_config(read_fields(args.config), str(args.config)) != run.config:
         raise UserError(f"{args.config}: differs from the run in {path}; resume without --config")
+    check_init(args.init, run, path)
     return run
 
 
-def first_state(run: Run) -> Any:
+def first_state(run: Run, network: Any) -> Any:
     """The newest saved state, or a fresh one."""
-    fresh = init_filter_state(run.config)
+    fresh = init_filter_state(run.config, network)
     return checkpoint.load_state(run.states()[-1], fresh) if run.states() else fresh
 
 
@@ -115,20 +132,20 @@ def make_batches(run: Run, grids: list[OccupancyGrid]) -> tuple[Callable[[int, i
     return lambda step, total: batch(jnp.int32(step)), stack_maps(pool, resolution)
 
 
-def parts(run: Run, maps: list[OccupancyGrid]) -> Parts:
+def parts(run: Run, material: Material) -> Parts:
     """Batches, step and evaluation of a run."""
-    grids = [replace(grid, origin=jnp.zeros(3)) for grid in maps]
+    grids = [replace(grid, origin=jnp.zeros(3)) for grid in material.grids]
     batches, places = make_batches(run, grids)
     step, evaluate = make_filter_step(run.config, places), make_tracking(run.config, grids)
-    return Parts(batches, step, evaluate, first_state(run), ("prediction", "prediction"))
+    return Parts(batches, step, evaluate, first_state(run, material.network), ("prediction", "prediction"))
 
 
 def main() -> None:
     """Entry point."""
     args = parse(Arguments, "python -m dsom_jax.train_filter")
     keep_freed_memory()
-    run, grids = open_run(args)
-    train(args, run, lambda: parts(run, grids))
+    run, material = open_run(args)
+    train(args, run, lambda: parts(run, material))
 
 
 if __name__ == "__main__":

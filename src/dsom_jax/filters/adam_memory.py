@@ -12,21 +12,21 @@ Particles refine what the grid is too coarse for; the grid carries the places th
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, NoReturn
 
 import jax
 import jax.numpy as jnp
 
 from dsom_jax import checks
 from dsom_jax.filters.adam_robust import AdamRobust, RobustState
+from dsom_jax.filters.memory import Recalling
 from dsom_jax.occupancy import is_free
 from dsom_jax.proposals.markov_grid import MarkovGrid, Recollection
-from dsom_jax.types import Array, Inputs
+from dsom_jax.types import Array
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class AdamMemory(AdamRobust):
+class AdamMemory(Recalling, AdamRobust):
     """Adaptive mixture of particles and grid localization.
 
     Attributes:
@@ -39,18 +39,6 @@ class AdamMemory(AdamRobust):
 
     def __post_init__(self) -> None:
         checks.span(self, "share")
-
-    def prepare(self, inputs: Inputs) -> NoReturn:
-        """TypeError: one scan alone is not what this filter's updates need; it would forget all the others."""
-        raise TypeError("AdamMemory: the proposal has a past; call begin() and recall() in place of prepare()")
-
-    def begin(self) -> Any:
-        """Memory before the first update."""
-        return self.proposal.begin()
-
-    def recall(self, memory: Any, inputs: Inputs) -> tuple[Recollection, Any]:
-        """The proposal for this update, and the memory after it."""
-        return self.proposal.recall(memory, inputs)
 
     def _share(self, state: RobustState) -> Array:
         """a ()."""

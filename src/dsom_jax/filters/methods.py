@@ -10,7 +10,7 @@ import jax
 
 from dsom_jax import checks
 from dsom_jax.episode import Episode
-from dsom_jax.filters.adam import AdamMCL
+from dsom_jax.filters.adam import AdamMCL, AdamRecalling
 from dsom_jax.filters.adam_memory import AdamMemory
 from dsom_jax.filters.adam_robust import AdamRobust, RobustConfig
 from dsom_jax.filters.mcl import MCL
@@ -41,14 +41,16 @@ COMBINATIONS: dict[str, tuple[Algorithm, str]] = {
     "adam_dsom": ("adam", "dsom"),
     "adam_likelihood_grid": ("adam", "likelihood_grid"),
     "adam_hybrid": ("adam", "hybrid"),
+    "adam_markov_grid": ("adam", "markov_grid"),
     "robust_dsom": ("adam_robust", "dsom"),
     "robust_likelihood_grid": ("adam_robust", "likelihood_grid"),
     "robust_hybrid": ("adam_robust", "hybrid"),
+    "robust_markov_grid": ("adam_robust", "markov_grid"),
 }
 LEARNED: dict[str, Callable[..., Filter]] = {"pf_net": pf_net, "pfrnn": pfrnn}
 """Filters that are networks themselves; each has the name of its kind of network."""
 _STAR = "_star"
-PARTS = {"hybrid": ("likelihood_grid", "dsom")}
+PARTS = {"hybrid": ("likelihood_grid", "dsom"), "markov_grid": ("likelihood_grid",)}
 METHODS: tuple[str, ...] = (*COMBINATIONS, *LEARNED)
 STANDARD: tuple[str, ...] = tuple(name for name, (_, proposal) in COMBINATIONS.items() if proposal not in PARTS)
 """Methods of the standard comparison; the others have to be asked for by name."""
@@ -65,6 +67,14 @@ WEIGHT_POWER = 8.0
 """Default of :attr:`Settings.weight_power`."""
 
 
+def estimate_power(weight_power: float) -> float:
+    """Power of Eq 15 in estimates: 16 where particles are drawn by its 8th power, and 1, as printed, for 1.
+
+    Draws have to leave room for places that are only likely, an average has not (experiments/dsom/REPORT.md).
+    """
+    return float(weight_power ** (4 / 3))
+
+
 @dataclass(frozen=True)
 class Settings:
     """What all filters of a comparison share; ``range_max`` of the sensor models follows the lidar.
@@ -75,10 +85,11 @@ class Settings:
         max_beams: beams used for weighing.
         seed: of what is random while a filter is built (the samples of Mixture MCL).
         motion, score, raycast: drive, Eq 15 and expected ranges of the paper's filters.
-        weight_power: particles are drawn and averaged by Eq 15 to this power, as if so many such scans had been seen;
-            1 as printed, where a particle elsewhere weighs half as much as one at the truth (experiments/REPORT.md).
-            Alg 1 with an exact likelihood as its proposal draws as printed: PM then is as good as sure, and what
-            gathers sooner than PM arrives stays at a wrong place that looks alike.
+        weight_power: particles are drawn by Eq 15 to this power, as if so many such scans had been seen; 1 as printed,
+            where a particle elsewhere weighs half as much as one at the truth (experiments/REPORT.md). Estimates
+            average by :func:`estimate_power`. Alg 1 with an exact likelihood as its proposal draws as printed and
+            averages by this power: PM then is as good as sure, and what gathers sooner than PM arrives stays at a wrong
+            place that looks alike.
         grid: the likelihood grid.
         sharpness: exponent of DSOM's PM in the paper's filters (``experiments/dsom``).
         hybrid: weights of likelihood grid and network.
@@ -194,9 +205,17 @@ def make_proposal(
         parts = (have.get(p) or make_proposal(p, grid, lidar, settings, checkpoint) for p in PARTS[name])
         likelihood, network = parts
         return Hybrid(likelihood, network, settings.hybrid)  # type: ignore[arg-type]  # as their names say
+    if name == "markov_grid":
+        grown = (made or {}).get("likelihood_grid") or make_proposal("likelihood_grid", grid, lidar, settings)
+        return remembering(grown, settings)  # type: ignore[arg-type]  # as its name says
     if name == "dual_features":
         return dual_features(jax.random.key(settings.seed), grid, lidar, DualFeaturesConfig())
     raise ValueError(f"make_proposal: no proposal is called {name!r}")
+
+
+def remembering(likelihood: LikelihoodGrid, settings: Settings) -> MarkovGrid:
+    """The likelihood grid with a memory of earlier scans."""
+    return MarkovGrid(likelihood.tempered(settings.memory_temper), settings.markov)
 
 
 def make_filter(
@@ -213,17 +232,21 @@ def make_filter(
         if isinstance(proposal, DSOMProposal):
             proposal = replace(proposal, sharpness=settings.robust_sharpness)
         if settings.memory and isinstance(proposal, LikelihoodGrid):
-            memory = MarkovGrid(proposal.tempered(settings.memory_temper), settings.markov)
-            return AdamMemory(tables, space, memory, *parts, settings.memory_share)
+            proposal = remembering(proposal, settings)
+        if isinstance(proposal, MarkovGrid):
+            return AdamMemory(tables, space, proposal, *parts, settings.memory_share)
         return AdamRobust(tables, space, proposal, *parts)
     score = replace(settings.score, range_max=lidar.range_max)
     tables = make_tables(grid, settings.raycast, lidar.range_max)
     world = World(tables, space, used, step, settings.motion, score)
     power = settings.weight_power
-    drawn = 1.0 if algorithm == "adam" and isinstance(proposal, LikelihoodGrid | Hybrid) else power
-    config = FilterConfig(settings.particles, weight_power=drawn, estimate_power=power)
+    exact = algorithm == "adam" and isinstance(proposal, LikelihoodGrid | Hybrid | MarkovGrid)
+    drawn, averaged = (1.0, power) if exact else (power, estimate_power(power))
+    config = FilterConfig(settings.particles, weight_power=drawn, estimate_power=averaged)
     if algorithm == "mcl":
         return MCL(world, config)
     if algorithm == "mixture_mcl":
         return MixtureMCL(world, proposal, config)
+    if isinstance(proposal, MarkovGrid):
+        return AdamRecalling(world, proposal, config, settings.t_cut)
     return AdamMCL(world, proposal, config, settings.t_cut)

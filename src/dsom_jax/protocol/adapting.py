@@ -1,4 +1,4 @@
-"""The network of a map: the one to start from, trained on for some minutes with the log's lidar in that building."""
+"""The networks of a map: those to start from, trained on for a while with the log's lidar in that building."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ import json
 import math
 import subprocess
 import sys
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import yaml
 
@@ -15,7 +16,7 @@ from dsom_jax import checkpoint
 from dsom_jax.atomic import write_atomic
 from dsom_jax.errors import UserError
 from dsom_jax.lidar import LidarConfig
-from dsom_jax.protocol.plan import Plan
+from dsom_jax.protocol.plan import Plan, merged
 
 
 def settings(start: Path, lidar: LidarConfig, changes: dict[str, Any]) -> dict[str, Any]:
@@ -25,10 +26,7 @@ def settings(start: Path, lidar: LidarConfig, changes: dict[str, Any]) -> dict[s
     reach = min(lidar.range_max, float(model["reach_min"]))
     model |= {"fov_min": view, "reach_min": reach}
     scan = {"fov_min": view, "fov_max": view, "reach_min": reach, "thinning": 2}
-    given = {"model": model, "scan": scan}
-    for name, value in changes.items():
-        given[name] = given[name] | value if isinstance(value, dict) and name in given else value
-    return given
+    return merged({"model": model, "scan": scan}, changes)
 
 
 def check_begun(folder: Path, made_of: dict[str, str]) -> None:
@@ -40,16 +38,53 @@ def check_begun(folder: Path, made_of: dict[str, str]) -> None:
     write_atomic(record, json.dumps(made_of).encode())
 
 
-def adapt(plan: Plan, map_yaml: Path, map_digest: str, start: Path, lidar: LidarConfig, folder: Path) -> Path:
-    """Folder of the network adapted to a map; a training that was killed goes on where it was."""
+def filter_settings(kind: str, start: Path, lidar: LidarConfig, changes: dict[str, Any]) -> dict[str, Any]:
+    """Fields of ``FilterTrainConfig`` for scans of ``lidar``, as far apart as those of clips, on top of ``start``."""
+    model = dict(checkpoint.load_provenance(start, kind)["model"])
+    view = model["view"]
+    reach = min(lidar.range_max, float(view["reach_min"]))
+    model["view"] = view | {"fov_min": min(lidar.fov, 2 * math.pi), "reach_min": reach}
+    data = {"lidar": asdict(lidar), "beam_step": -(-lidar.beams // view["beams"])}
+    return merged({"model": model, "data": data}, changes)
+
+
+class Site(NamedTuple):
+    """Where networks are trained on: a map's file and digest, the lidar of its logs, and the folder for networks."""
+
+    map_yaml: Path
+    map_digest: str
+    lidar: LidarConfig
+    folder: Path
+
+
+def adapt(plan: Plan, site: Site, start: Path) -> Path:
+    """Folder of the DSOM adapted to a map."""
     if not plan.adapt_minutes > 0:
         return start
-    check_begun(folder, {"map": map_digest, "start": checkpoint.digest(start)})
+    length = ("steps", plan.adapt_steps) if plan.adapt_steps else ("minutes", plan.adapt_minutes)
+    return train_on(("dsom_jax.train",), settings(start, site.lidar, plan.adapt), length, site, start, "")
+
+
+def adapt_filter(plan: Plan, site: Site, start: Path, kind: str) -> Path:
+    """Folder of the PF-Net or PFRNN, as ``kind`` says, trained on in a map."""
+    if not plan.learn_steps:
+        return start
+    command = ("dsom_jax.train_filter", "--filter", kind)
+    fields = filter_settings(kind, start, site.lidar, plan.learn)
+    return train_on(command, fields, ("steps", plan.learn_steps), site, start, f"-{kind}")
+
+
+def train_on(
+    command: tuple[str, ...], fields: dict[str, Any], length: tuple[str, float], site: Site, start: Path, suffix: str
+) -> Path:
+    """Folder of a network trained on from ``start``; a training that was killed goes on where it was."""
+    unit, amount = length
+    folder = site.folder.with_name(f"{site.folder.name}{suffix}-{amount:g}-{unit.removesuffix('utes')}")
+    check_begun(folder, {"map": site.map_digest, "start": checkpoint.digest(start)})
     config = folder.with_suffix(".yaml")
-    write_atomic(config, yaml.safe_dump(settings(start, lidar, plan.adapt)).encode())
-    length = ("--steps", plan.adapt_steps) if plan.adapt_steps else ("--minutes", plan.adapt_minutes)
-    words = ["--maps", map_yaml, "--init", start, "--config", config, *length, "--out", folder, "--resume"]
-    done = subprocess.run([sys.executable, "-m", "dsom_jax.train", *map(str, words)])
+    write_atomic(config, yaml.safe_dump(fields).encode())
+    words = ["--maps", site.map_yaml, "--init", start, "--config", config, f"--{unit}", amount, "--out", folder]
+    done = subprocess.run([sys.executable, "-m", *command, *map(str, words), "--resume"])
     if done.returncode:
-        raise UserError(f"{folder}: training on {map_yaml.name} failed; its message is above")
+        raise UserError(f"{folder}: training on {site.map_yaml.name} failed; its message is above")
     return folder

@@ -11,7 +11,7 @@ from dsom_jax.data import load_map
 from dsom_jax.data.suite import Suite
 from dsom_jax.errors import UserError
 from dsom_jax.filters.methods import network_of
-from dsom_jax.protocol.adapting import adapt
+from dsom_jax.protocol.adapting import Site, adapt, adapt_filter
 from dsom_jax.protocol.clips import choose
 from dsom_jax.protocol.digests import map_digest
 from dsom_jax.protocol.plan import Plan, Variant, map_file, read_logs, read_plan, variants
@@ -72,18 +72,19 @@ def start_network(plan: Plan, args: Args) -> Path | None:
 def run_map(plan: Plan, suite: Suite, map_yaml: Path, start: Path | None, name: str, out: Path, work: Path) -> None:
     """What is missing of the results of one map, in ``out``/NAME and ``work``/NAME."""
 
+    site = Site(map_yaml, map_digest(suite.episodes[0][1]), suite.lidar, work / "networks" / name)
+
     @cache
-    def adapted() -> Path | None:
-        length = f"{plan.adapt_steps}-steps" if plan.adapt_steps else f"{plan.adapt_minutes:g}-min"
-        folder, grid = work / "networks" / f"{name}-{length}", suite.episodes[0][1]
-        return start and adapt(plan, map_yaml, map_digest(grid), start, suite.lidar, folder)
+    def adapted(kind: str, begin: Path) -> Path:
+        return adapt(plan, site, begin) if kind == "dsom" else adapt_filter(plan, site, begin, kind)
 
     def begun(variant: Variant) -> Path | None:
         kind = network_of(variant.method)
         return start if kind == "dsom" else checkpoint.shipped(kind) if kind else None
 
     def network(variant: Variant) -> Path | None:
-        return begun(variant) if variant.shipped or network_of(variant.method) != "dsom" else adapted()
+        kind, begin = network_of(variant.method), begun(variant)
+        return adapted(kind, begin) if kind and begin and not variant.shipped else begin
 
     folders = report.output_folder(out / name), report.output_folder(work / name)
     build = Builder(plan, suite, network)

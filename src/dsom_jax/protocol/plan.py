@@ -33,7 +33,7 @@ class Plan:
         maps: name -> ``yaml``, the map's file in the data folder, or the fields of one (``image`` or ``drawing``,
             relative to the data folder). A drawing may have ``box``: [left, top, right, bottom] in metres from its
             upper left corner, in place of ``crop``. ``logs`` and ``map_kind`` of a map replace those below,
-            ``adapt`` adds to it.
+            ``adapt`` and ``learn`` add to them.
         logs: patterns of files or folders in the data folder; FILE.tum beside FILE is its reference, if it is there.
         scan_topic, odom_topic: of bags; empty where there is no choice.
         methods: names as in the benchmark; ``NAME@shipped`` takes a network as it is shipped.
@@ -47,6 +47,8 @@ class Plan:
         adapt_minutes: of training on each map before it is used, where a method needs the network; 0 for none.
         adapt_steps: of that training in place of minutes, so that any machine does the same; 0 goes by the clock.
         adapt: fields of ``TrainConfig`` for that training that differ from those of :func:`.adapting.settings`.
+        learn_steps: of training PF-Net and PFRNN on in each map before they are used; 0 takes them as they are shipped.
+        learn: fields of ``FilterTrainConfig`` for it that differ from those of :func:`.adapting.filter_settings`.
     """
 
     name: str = "data"
@@ -68,14 +70,22 @@ class Plan:
     adapt_minutes: float = 30.0
     adapt_steps: int = 0
     adapt: dict[str, Any] = field(default_factory=dict)
+    learn_steps: int = 0
+    learn: dict[str, Any] = field(default_factory=dict)
 
     def on(self, name: str) -> tuple[Plan, dict[str, Any]]:
         """The plan of one map with what it replaces, and the fields that describe the map itself."""
         fields = dict(self.maps[name])
         own = {key: fields.pop(key) for key in ("logs", "map_kind") if key in fields}
-        own["adapt"] = self.adapt | fields.pop("adapt", {})
+        own |= {key: merged(getattr(self, key), fields.pop(key, {})) for key in ("adapt", "learn")}
         # An empty tuple or mapping takes any.
-        return override(replace(self, logs=(), adapt={}), {"logs": list(self.logs), **own}, name), fields
+        return override(replace(self, logs=(), adapt={}, learn={}), {"logs": list(self.logs), **own}, name), fields
+
+
+def merged(given: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+    """Fields with those that ``changes`` replace; fields of fields alike."""
+    inner = {name: merged(given[name], value) for name, value in changes.items() if isinstance(given.get(name), dict)}
+    return given | changes | inner
 
 
 @dataclass(frozen=True)

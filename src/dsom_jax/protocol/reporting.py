@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from dsom_jax import plotting, report
+from dsom_jax.filters import methods
 from dsom_jax.protocol.plan import Plan, Variant, variants
 from dsom_jax.protocol.running import read_entry
 from dsom_jax.run_table import RunTable, from_columns, join, paired
@@ -37,6 +38,8 @@ Every clip starts without any prior on the pose; at its end the robot is carried
 - sure and wrong: updates at which the filter claims to know (lost < 5 %) and is not within 2 m and 10 deg
 - the paper's filters are judged by the weighted mean of the particles, robust ones by the heaviest cluster
 - network: as shipped, or trained on in this map for so long
+- `adam_markov_grid` and `robust_likelihood_grid` draw from what all scans so far say (as `localize` does), all others
+  from what the last one says
 """
 
 
@@ -135,13 +138,18 @@ def pairs(entries: dict[Variant, dict[str, Any]]) -> Iterator[tuple[Variant, Var
 
 
 def comparable(entries: dict[Variant, dict[str, Any]], variant: Variant, other: Variant) -> bool:
-    """Whether both have every run, of the same map, clips, seed, runs and particles, and of one adapted network."""
+    """Whether both have every run, of the same map, clips, seed, runs and particles, and no two DSOMs adapted to it."""
     sides = [entries[variant], entries[other]]
     if not all("each_run" in side for side in sides):
         return False
-    adapted = {side["network"].get("digest") for side in sides if side["network"] and not side["network"]["shipped"]}
     same = ("map_digest", "clips_digest", "seed", "runs", "particles", "clips", "updates")
-    return len(adapted) < 2 and all(sides[0][key] == sides[1][key] for key in same)
+    trained = {
+        (methods.network_of(v.method), entries[v]["network"].get("digest"))
+        for v in (variant, other)
+        if entries[v]["network"] and not entries[v]["network"]["shipped"]
+    }
+    one_each = len(trained) == len({kind for kind, _ in trained})
+    return one_each and all(sides[0][key] == sides[1][key] for key in same)
 
 
 def runs_of(variant: Variant, entry: dict[str, Any]) -> RunTable:

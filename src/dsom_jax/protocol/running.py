@@ -87,14 +87,21 @@ def network_facts(folder: Path | None, variant: Variant) -> dict[str, Any] | Non
 
 def identity(variant: Variant, plan: Plan, suite: Suite, start: Path | None) -> dict[str, Any]:
     """What must be the same for a result to be kept; ``start`` is the network that it uses, or that was trained on."""
-    adapted = network_of(variant.method) == "dsom" and not variant.shipped
-    training = {"adapt_minutes": plan.adapt_minutes, "adapt_steps": plan.adapt_steps, "adapt": plan.adapt}
-    return (training if adapted else {}) | {
+    return trained_on(variant, plan) | {
         "suite": suite.name, "map_kind": plan.map_kind, "runs": plan.runs, "particles": plan.particles,
         "clips": plan.clips, "updates": plan.updates, "seed": plan.seed, "laser_max_range": plan.laser_max_range,
         "map_digest": map_digest(suite.episodes[0][1]), "clips_digest": clips_digest(suite),
         "start_digest": start and checkpoint.digest(start),
     }  # fmt: skip
+
+
+def trained_on(variant: Variant, plan: Plan) -> dict[str, Any]:
+    """How the network of a variant is trained on in the map; nothing if it has none, or uses it as it is shipped."""
+    kind = network_of(variant.method)
+    if kind is None or variant.shipped:
+        return {}
+    names = ("adapt_minutes", "adapt_steps", "adapt") if kind == "dsom" else ("learn_steps", "learn")
+    return {name: getattr(plan, name) for name in names}
 
 
 def is_done(variant: Variant, made_of: dict[str, Any], out: Path) -> bool:

@@ -102,9 +102,9 @@ def graph_of(config: FilterTrainConfig) -> Any:
     return nnx.split(nnx.eval_shape(lambda: KINDS[config.kind].create(config.model)))[0]
 
 
-def init_filter_state(config: FilterTrainConfig) -> FilterTrainState:
-    """State before the first step."""
-    params = nnx.as_pure(nnx.split(KINDS[config.kind].create(config.model, config.seed))[1])
+def init_filter_state(config: FilterTrainConfig, model: Any = None) -> FilterTrainState:
+    """State before the first step, with the weights of ``model`` or fresh ones."""
+    params = nnx.as_pure(nnx.split(model or KINDS[config.kind].create(config.model, config.seed))[1])
     # The average gets buffers of its own: the step donates all of the state.
     average = jax.tree.map(jnp.copy, params)
     return FilterTrainState(jnp.zeros((), jnp.int32), params, optimizer(config).init(params), average)
