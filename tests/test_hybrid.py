@@ -12,13 +12,14 @@ import pytest
 
 import tiny_world
 from dsom_jax import pose_grid as pg
-from dsom_jax.filters.methods import Settings, make_filter, make_proposal
+from dsom_jax.filters.methods import LEARNED, METHODS, Settings, make_filter, make_proposal, powers_of
 from dsom_jax.geometry import compose
 from dsom_jax.nn import DSOMConfig, create, evaluation_view
 from dsom_jax.occupancy import is_free, resample
 from dsom_jax.proposals.dsom import dsom
 from dsom_jax.proposals.hybrid import Hybrid, HybridConfig, interpolate_headings
 from dsom_jax.proposals.likelihood_grid import LikelihoodGridConfig, likelihood_grid
+from dsom_jax.proposals.markov_grid import MarkovGrid
 from dsom_jax.proposals.uniform import free_space
 from dsom_jax.sensor import BeamModel
 from dsom_jax.types import Inputs
@@ -134,6 +135,18 @@ def test_a_network_is_sharpened_for_the_papers_filters_and_not_for_robust_ones(s
     assert proposal.sharpness == 2.5
 
 
+def test_powers_of_methods_are_those_of_their_filters():
+    found = {name: powers_of(name) for name in METHODS}
+    assert {name for name, powers in found.items() if powers is None} == {
+        *LEARNED, *(name for name in METHODS if name.startswith("robust_"))
+    }  # fmt: skip
+    assert {name for name, powers in found.items() if powers == (1.0, 8.0)} == {
+        "adam_likelihood_grid", "adam_hybrid", "adam_markov_grid"
+    }  # fmt: skip
+    assert found["adam_dsom"] == found["mcl"] == found["mixture_mcl_star"] == (8.0, 16.0)
+    assert powers_of("adam_dsom", 1.0) == (1.0, 1.0)
+
+
 def test_power_one_is_as_printed():
     for name in ("adam", "mixture_mcl", "mcl"):
         source, settings = free_space(tiny_world.grid()), Settings(weight_power=1.0)
@@ -145,8 +158,9 @@ def test_power_one_is_as_printed():
 def test_alg_1_draws_as_printed_from_an_exact_likelihood_only(parts, exact):
     """All else draws by Eq 15 to the power, and averages by a higher one."""
     settings = Settings(weight_power=8.0, grid=GRID)
-    for source in (parts[0], Hybrid(*parts, HybridConfig())) if exact else (parts[1],):
+    memory = MarkovGrid(parts[0])
+    for source in (parts[0], Hybrid(*parts, HybridConfig()), memory) if exact else (parts[1],):
         for name in ("adam", "mixture_mcl", "mcl"):
             config = make_filter(name, source, tiny_world.grid(), LIDAR, settings).config
             drawn, averaged = (1.0, 8.0) if exact and name == "adam" else (8.0, 16.0)
-            assert (config.weight_power, config.estimate_power) == (drawn, pytest.approx(averaged))
+            assert (config.weight_power, config.estimate_power) == (drawn, averaged)

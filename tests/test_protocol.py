@@ -24,7 +24,7 @@ from dsom_jax.filters.methods import DRAWN, LEARNED
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.metrics import measure_errors, pool, summarize
 from dsom_jax.occupancy import from_cells
-from dsom_jax.protocol import adapting, clips, reporting, running
+from dsom_jax.protocol import adapting, clips, command, reporting, running
 from dsom_jax.protocol.plan import Plan, Variant, read_plan, variants
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -108,6 +108,7 @@ def test_results_are_kept_only_of_the_same_map_logs_and_network(tmp_path):
     ]
     (start / "provenance.json").write_text("{ }")
     changed.append(running.identity(variant, plan, made_suite(grid), start))
+    assert first["powers"] == [8.0, 16.0]
     assert again == first and not any(running.is_done(variant, c, tmp_path) for c in changed)
 
 
@@ -125,6 +126,8 @@ def test_mounts_that_differ_by_rounding_are_one_lidar():
         ("{yaml: a.yaml, box: [0, 0, 1, 1]}", "box needs a drawing"),
         ("{drawing: a.dxf, units: miles, box: [0, 0, 1, 1]}", "units out of mm"),
         ("{drawing: a.dxf, box: [0, 0, 1]}", "box = "),
+        ("{yaml: a.yaml, learn: }", "learn = None: give fields"),
+        ("{yaml: a.yaml, adapt: 3}", "adapt = 3: give fields"),
     ],
 )
 def test_maps_that_are_described_wrongly(tmp_path, fields, message):
@@ -158,9 +161,13 @@ def test_training_is_called_with_words_that_it_knows(monkeypatch, tmp_path):
     folder.mkdir()
     with pytest.raises(UserError, match="another map"):
         adapting.adapt(plan, site._replace(map_digest="b"), start)
+    written = folder.with_suffix(".json").read_bytes()
     folder.with_suffix(".json").unlink()
     with pytest.raises(UserError, match="another map"):
         adapting.adapt(plan, site, start)
+    adapting.write_atomic(folder.with_suffix(".json"), written)
+    with pytest.raises(UserError, match="other fields"):
+        adapting.adapt(replace(plan, adapt={"warmup": 7}), site, start)
 
 
 @pytest.mark.parametrize("kind", LEARNED)
@@ -205,6 +212,37 @@ def made_like(**changes: Any) -> dict[str, Any]:
 def test_only_what_was_made_alike_is_compared(one, other, alike):
     a, b = Variant("adam_dsom", False, 0.6), Variant("adam_hybrid", False, 0.6)
     assert reporting.comparable({a: made_like(**one), b: made_like(**other)}, a, b) == alike
+
+
+@pytest.mark.parametrize("kind", LEARNED)
+def test_results_of_filters_depend_on_their_own_training_alone(kind):
+    plan = Plan(learn_steps=5, learn={"warmup": 1}, adapt={"warmup": 2})
+    mine, network = (running.trained_on(Variant(name), plan) for name in (kind, "adam_dsom"))
+    assert mine == {"learn_steps": 5, "learn": {"warmup": 1}}
+    assert network == {"adapt_minutes": 30.0, "adapt_steps": 0, "adapt": {"warmup": 2}}
+    assert not running.trained_on(Variant(kind, shipped=True), plan) and not running.trained_on(Variant("mcl"), plan)
+
+
+def test_each_kind_of_network_is_trained_on_once_in_a_map(monkeypatch, tmp_path):
+    trained, used = [], {}
+    monkeypatch.setattr(command, "adapt", lambda plan, site, start: trained.append("dsom") or Path("new-dsom"))
+    monkeypatch.setattr(command, "adapt_filter", lambda *words: trained.append(words[-1]) or Path(f"new-{words[-1]}"))
+
+    def note(variant, plan, suite, build, made_of, out, work):
+        used[variant.stem] = build.networks(variant), made_of["start_digest"]
+
+    monkeypatch.setattr(command, "run_variant", note)
+    methods = ("mcl", "adam_dsom@shipped", "adam_dsom", "pf_net", "pf_net@shipped", "pfrnn")
+    grid = from_cells(np.zeros((4, 4), bool), np.ones((4, 4), bool), resolution=0.1)
+    start, plan = ROOT / "checkpoints" / "dsom", Plan(methods=methods, t_cuts=(0.6, 0.5), learn_steps=3)
+    command.run_map(plan, made_suite(grid), tmp_path / "m.yaml", start, "hall", tmp_path / "out", tmp_path / "work")
+    shipped = {kind: checkpoint.shipped(kind) for kind in LEARNED}
+    assert {stem: folder for stem, (folder, _) in used.items()} == {
+        "mcl": None, "pf_net": Path("new-pf_net"), "pf_net-shipped": shipped["pf_net"], "pfrnn": Path("new-pfrnn"),
+        **{f"adam_dsom-{cut}": Path("new-dsom") for cut in (0.6, 0.5)},
+        **{f"adam_dsom-shipped-{cut}": start for cut in (0.6, 0.5)},
+    }  # fmt: skip
+    assert trained == ["dsom", "pf_net", "pfrnn"] and used["pfrnn"][1] == checkpoint.digest(shipped["pfrnn"])
 
 
 def test_networks_of_two_kinds_need_not_be_one():

@@ -39,6 +39,8 @@ def main() -> None:
     """Rows one after another, each printed as it comes."""
     args = parse(Args, "python experiments/dsom/ablation.py")
     given = read_yaml(args.config, "ablation")
+    if missing := [name for name in ("base", "minutes", "rows") if name not in given]:
+        raise UserError(f"{args.config}: field {missing[0]} is missing; give base, minutes and rows")
     report.output_folder(args.out.parent)
     rows = json.loads(args.out.read_text()) if args.out.exists() else {}
     for name, changes in given["rows"].items():

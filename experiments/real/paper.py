@@ -1,9 +1,9 @@
 """The paper's protocol on real logs: ``python experiments/real/paper.py [--runs 5] [--only intel]``.
 
-For each map of ``paper.yaml``: the network is adapted to the building, three clips of the log are chosen and joined as
-kidnappings, and every method is run on them. ``paper/MAP/METHOD.json`` are the results; ``paper/REPORT.md`` and the
-figures come from them. Networks and pictures of runs lie in ``--work``. What exists is kept, so an interrupted series
-continues where it was; ``--adapt-minutes 0`` takes the network as it is.
+For each map of ``paper.yaml``: the networks are trained on in the building, three clips of the log are chosen and
+joined as kidnappings, and every method is run on them. ``paper/MAP/METHOD.json`` are the results; ``paper/REPORT.md``
+and the figures come from them. Networks and pictures of runs lie in ``--work``. What exists is kept, so an interrupted
+series continues where it was; ``--adapt-minutes 0 --learn-steps 0`` takes the networks as they are.
 """
 
 from __future__ import annotations

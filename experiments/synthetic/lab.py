@@ -26,7 +26,7 @@ from dsom_jax.compiling import run_options
 from dsom_jax.data.suite import Suite, load_suite
 from dsom_jax.episode import Episode
 from dsom_jax.errors import UserError
-from dsom_jax.filters.methods import WEIGHT_POWER, build_filter, network_of
+from dsom_jax.filters.methods import WEIGHT_POWER, build_filter, network_of, powers_of
 from dsom_jax.montecarlo import run_keys
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.run_folder import commit
@@ -43,6 +43,8 @@ PROPOSALS = {
 }
 """Proposals that are compared: what figures call them, and their colours."""
 NETWORKS = ("dsom", "pf_net", "pfrnn")
+POWERS = powers_of("adam_dsom")
+"""Powers of Eq 15 by which filters draw and average; part of what results depend on."""
 Results = Mapping[str, dict[str, Any]]
 """What the jobs of one piece gave, by job."""
 Everything = Mapping[str, Results]
@@ -56,15 +58,13 @@ class Lab:
     Attributes:
         seed: of all randomness.
         sources: proposals that were made, by the name of the map.
-        scenes: what PM is on a sequence, by proposal, exponent and sequence (:mod:`retention`).
         piece: what runs at present.
-        shared: what its jobs have in common, by configuration.
+        shared: what its jobs have in common, by what it depends on.
         commit: of the code when this process began.
     """
 
     seed: int = 0
     sources: dict[str, dict[str, Proposal]] = field(default_factory=dict)
-    scenes: dict[tuple[str, float, int], Any] = field(default_factory=dict)
     piece: str = ""
     shared: dict[Any, Any] = field(default_factory=dict)
     commit: str = field(default_factory=commit)

@@ -7,7 +7,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from lab import Everything, Lab, Piece, column
+from lab import POWERS, Everything, Lab, Piece, column
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator
@@ -29,13 +29,14 @@ ROWS = {"within_20": "converged within 20 updates [%]", "retention": "updates ke
 
 @dataclass(frozen=True)
 class Config:
-    """Attributes: methods; factors on the error of every increment; runs of each on each sequence; particles."""
+    """Attributes: methods; factors on the error of each increment; runs of each on each sequence; particles; powers."""
 
     methods: tuple[str, ...] = ("adam_dsom", "adam_likelihood_grid", "adam_hybrid",
                                 "robust_dsom", "robust_likelihood_grid", "robust_hybrid")  # fmt: skip
     factors: tuple[float, ...] = (1, 2, 3, 4, 5)
     runs: int = 15
     particles: int = 200
+    powers: tuple[float, float] | None = POWERS
 
 
 def jobs(config: Config) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from typing import Any
 
 import comparison
 import paper
-from lab import Everything, Lab, Piece
+from lab import POWERS, Everything, Lab, Piece
 from tables import bounds, markdown, number, percent
 
 from dsom_jax import bench
@@ -20,11 +20,12 @@ METHOD = "adam_dsom"
 
 @dataclass(frozen=True)
 class Config:
-    """Attributes: numbers of particles beside the 200 of the comparison; runs of each on each sequence; T_cut."""
+    """Attributes: numbers of particles beside 200, the comparison's; runs of each on each sequence; T_cut; powers."""
 
     particles: tuple[int, ...] = (500, 1000)
     runs: int = 50
     t_cut: float = 0.6
+    powers: tuple[float, float] | None = POWERS
 
 
 def jobs(config: Config) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 import paper
 from departures import Part, Scene, departures
-from lab import PROPOSALS, Everything, Lab, Piece, column
+from lab import POWERS, PROPOSALS, Everything, Lab, Piece, column
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from side_by_side import other_t_cut, run_all
@@ -33,12 +33,13 @@ DSOM = "adam_dsom"
 
 @dataclass(frozen=True)
 class Config:
-    """Attributes: proposals; values of T_cut; runs of each on each sequence; particles."""
+    """Attributes: proposals; values of T_cut; runs of each on each sequence; particles; powers."""
 
     proposals: tuple[str, ...] = ("dsom", "likelihood_grid", "hybrid")
     t_cuts: tuple[float, ...] = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
     runs: int = 25
     particles: int = 200
+    powers: tuple[float, float] | None = POWERS
 
 
 def jobs(config: Config) -> dict[str, Any]:
@@ -68,7 +69,7 @@ def follow(
         results = [run(filter, episode, keys)]
     # Alg 1 and AdaM robust draw from the same proposals, but for the exponent of a network's PM.
     which = COMBINATIONS[name][1], getattr(filter.proposal, "sharpness", 1.0), number
-    scene = lab.scenes[which] = lab.scenes.get(which) or scene_of(lab, filter, where, grid, episode)
+    scene = lab.shared[which] = lab.shared.get(which) or scene_of(lab, filter, where, grid, episode)
     return [Part(name, number, episode, result, scene) for result in results]
 
 

@@ -38,7 +38,8 @@ class Args:
     suite: str = "synthetic-v1"
     """Name of a suite, or a TOML file that describes one."""
     methods: str = ""
-    """Comma-separated method names; default: the eight of the standard comparison (not the hybrids, PF-Net and PFRNN),
+    """Comma-separated method names; default: the eight of the standard comparison (not the hybrids, grids with
+    a memory, PF-Net and PFRNN),
     without those that need a network where none is shipped."""
     particles: int = 200
     """Particles per run."""
@@ -47,7 +48,7 @@ class Args:
     seed: int = 0
     """Seed of all randomness; method, sequence and run number do the rest."""
     weight_power: float = WEIGHT_POWER
-    """Power of Eq 15 by which particles are drawn and averaged (:class:`filters.methods.Settings`); 1 as printed."""
+    """Power of Eq 15 by which particles are drawn, and averaged (:func:`filters.methods.powers`); 1 as printed."""
     out: Path | None = None
     """Folder for bench.json, bench.md and figures."""
     checkpoint: Path | None = None

@@ -51,6 +51,9 @@ LEARNED: dict[str, Callable[..., Filter]] = {"pf_net": pf_net, "pfrnn": pfrnn}
 """Filters that are networks themselves; each has the name of its kind of network."""
 _STAR = "_star"
 PARTS = {"hybrid": ("likelihood_grid", "dsom"), "markov_grid": ("likelihood_grid",)}
+EXACT_TYPES: dict[type, str] = {LikelihoodGrid: "likelihood_grid", Hybrid: "hybrid", MarkovGrid: "markov_grid"}
+EXACT = frozenset(EXACT_TYPES.values())
+"""Proposals that hold the exact likelihood of a scan."""
 METHODS: tuple[str, ...] = (*COMBINATIONS, *LEARNED)
 STANDARD: tuple[str, ...] = tuple(name for name, (_, proposal) in COMBINATIONS.items() if proposal not in PARTS)
 """Methods of the standard comparison; the others have to be asked for by name."""
@@ -67,12 +70,24 @@ WEIGHT_POWER = 8.0
 """Default of :attr:`Settings.weight_power`."""
 
 
-def estimate_power(weight_power: float) -> float:
-    """Power of Eq 15 in estimates: 16 where particles are drawn by its 8th power, and 1, as printed, for 1.
+def powers(algorithm: str, source: str, weight_power: float) -> tuple[float, float]:
+    """Powers of Eq 15 by which a filter that weighs by it draws and averages; ``source`` is its proposal.
 
-    Draws have to leave room for places that are only likely, an average has not (experiments/dsom/REPORT.md).
+    Draws have to leave room for places that are only likely, an average has not: it goes by 16 where draws go by 8,
+    and by 1, as printed, where they do (experiments/dsom/REPORT.md). Alg 1 with an exact likelihood as its proposal
+    draws as printed and averages by ``weight_power``: PM then is as good as sure, and what gathers sooner than PM
+    arrives stays at a wrong place that looks alike.
     """
-    return float(weight_power ** (4 / 3))
+    if algorithm == "adam" and source in EXACT:
+        return 1.0, weight_power
+    return weight_power, round(weight_power ** (4 / 3), 9)
+
+
+def powers_of(method: str, weight_power: float = WEIGHT_POWER) -> tuple[float, float] | None:
+    """:func:`powers` of a method of :data:`METHODS`; None for those that do not weigh by Eq 15."""
+    if method in LEARNED or COMBINATIONS[method][0] == "adam_robust":
+        return None
+    return powers(*COMBINATIONS[method], weight_power)
 
 
 @dataclass(frozen=True)
@@ -87,9 +102,7 @@ class Settings:
         motion, score, raycast: drive, Eq 15 and expected ranges of the paper's filters.
         weight_power: particles are drawn by Eq 15 to this power, as if so many such scans had been seen; 1 as printed,
             where a particle elsewhere weighs half as much as one at the truth (experiments/REPORT.md). Estimates
-            average by :func:`estimate_power`. Alg 1 with an exact likelihood as its proposal draws as printed and
-            averages by this power: PM then is as good as sure, and what gathers sooner than PM arrives stays at a wrong
-            place that looks alike.
+            average by another, and Alg 1 with an exact likelihood is an exception: :func:`powers`.
         grid: the likelihood grid.
         sharpness: exponent of DSOM's PM in the paper's filters (``experiments/dsom``).
         hybrid: weights of likelihood grid and network.
@@ -239,9 +252,7 @@ def make_filter(
     score = replace(settings.score, range_max=lidar.range_max)
     tables = make_tables(grid, settings.raycast, lidar.range_max)
     world = World(tables, space, used, step, settings.motion, score)
-    power = settings.weight_power
-    exact = algorithm == "adam" and isinstance(proposal, LikelihoodGrid | Hybrid | MarkovGrid)
-    drawn, averaged = (1.0, power) if exact else (power, estimate_power(power))
+    drawn, averaged = powers(algorithm, EXACT_TYPES.get(type(proposal), ""), settings.weight_power)
     config = FilterConfig(settings.particles, weight_power=drawn, estimate_power=averaged)
     if algorithm == "mcl":
         return MCL(world, config)

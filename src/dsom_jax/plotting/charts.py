@@ -20,9 +20,11 @@ STYLES = {
     "adam_dsom": ("AdaM + DSOM", "#d62728"),
     "adam_likelihood_grid": ("AdaM + likelihood grid", "#ff7f0e"),
     "adam_hybrid": ("AdaM + hybrid", "#b5179e"),
+    "adam_markov_grid": ("AdaM + Markov grid", "#7f3b08"),
     "robust_dsom": ("robust + DSOM", "#1f77b4"),
     "robust_likelihood_grid": ("robust + likelihood grid", "#2ca02c"),
     "robust_hybrid": ("robust + hybrid", "#17becf"),
+    "robust_markov_grid": ("robust + Markov grid", "#006d2c"),
     "pf_net": ("PF-Net", "#bcbd22"),
     "pfrnn": ("PFRNN", "#9467bd"),
 }

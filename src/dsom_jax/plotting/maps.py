@@ -83,7 +83,10 @@ def moment_figure(
     particles: Any,
     estimates: Any,
 ) -> Figure:
-    """A filter at updates ``times`` (K,): its particles (K, N, 3), estimates (T, 3), and the PM it drew from."""
+    """A filter at updates ``times`` (K,): its particles (K, N, 3), estimates (T, 3), and the PM it drew from.
+
+    Of a proposal that remembers, PM is that of the scan alone.
+    """
     proposal = getattr(filter, "proposal", None)
     views, titles = [], []
     for t, poses in zip(times, np.asarray(particles), strict=True):
@@ -106,7 +109,8 @@ def _prepare(proposal: Proposal, inputs: Inputs) -> Any:
 
 def _pm_of(prepared: Any) -> dict[str, Any]:
     """The first probability map in what a filter prepared, as arguments of :func:`map_view`."""
-    leaves = jax.tree.leaves(prepared, is_leaf=lambda leaf: isinstance(leaf, ProbabilityMap))
+    drawn = getattr(prepared, "posterior", prepared)
+    leaves = jax.tree.leaves(drawn, is_leaf=lambda leaf: isinstance(leaf, ProbabilityMap))
     for pm in (leaf for leaf in leaves if isinstance(leaf, ProbabilityMap)):
         return {"pm": pm.mass, "pm_origin": pm.pose_grid.origin, "pm_resolution": pm.pose_grid.resolution}
     return {}

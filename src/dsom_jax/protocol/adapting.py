@@ -29,22 +29,25 @@ def settings(start: Path, lidar: LidarConfig, changes: dict[str, Any]) -> dict[s
     return merged({"model": model, "scan": scan}, changes)
 
 
-def check_begun(folder: Path, made_of: dict[str, str]) -> None:
-    """Note what a network is made of; UserError unless the one in ``folder``, if any, is of the same."""
-    record = folder.with_suffix(".json")
+def check_begun(folder: Path, made_of: dict[str, str], config: str) -> None:
+    """Note what a network is made of, and how; UserError unless the one in ``folder``, if any, is of the same."""
+    record, fields = folder.with_suffix(".json"), folder.with_suffix(".yaml")
     if folder.exists() and (json.loads(record.read_text()) if record.is_file() else None) != made_of:
         why = f"trained on another map, or from another network, or {record.name} beside it is lost"
         raise UserError(f"{folder}: {why}; delete it to train again")
+    if folder.exists() and fields.is_file() and fields.read_text() != config:
+        raise UserError(f"{folder}: trained with other fields ({fields.name} beside it); delete it to train again")
     write_atomic(record, json.dumps(made_of).encode())
+    write_atomic(fields, config.encode())
 
 
 def filter_settings(kind: str, start: Path, lidar: LidarConfig, changes: dict[str, Any]) -> dict[str, Any]:
-    """Fields of ``FilterTrainConfig`` for scans of ``lidar``, as far apart as those of clips, on top of ``start``."""
-    model = dict(checkpoint.load_provenance(start, kind)["model"])
-    view = model["view"]
-    reach = min(lidar.range_max, float(view["reach_min"]))
-    model["view"] = view | {"fov_min": min(lidar.fov, 2 * math.pi), "reach_min": reach}
-    data = {"lidar": asdict(lidar), "beam_step": -(-lidar.beams // view["beams"])}
+    """Fields of ``FilterTrainConfig`` for scans of ``lidar``, on top of the network in ``start``."""
+    view = checkpoint.load(start, kind=kind).config.view
+    reach = min(lidar.range_max, view.reach_min)
+    scans = {"fov_min": min(lidar.fov, 2 * math.pi), "reach_min": reach}
+    model = merged(checkpoint.load_provenance(start, kind)["model"], {"view": scans})
+    data = {"lidar": asdict(lidar), "beam_step": view.beam_step(lidar)}
     return merged({"model": model, "data": data}, changes)
 
 
@@ -79,10 +82,9 @@ def train_on(
 ) -> Path:
     """Folder of a network trained on from ``start``; a training that was killed goes on where it was."""
     unit, amount = length
-    folder = site.folder.with_name(f"{site.folder.name}{suffix}-{amount:g}-{unit.removesuffix('utes')}")
-    check_begun(folder, {"map": site.map_digest, "start": checkpoint.digest(start)})
+    folder = site.folder.with_name(f"{site.folder.name}{suffix}-{amount:.9g}-{unit.removesuffix('utes')}")
+    check_begun(folder, {"map": site.map_digest, "start": checkpoint.digest(start)}, yaml.safe_dump(fields))
     config = folder.with_suffix(".yaml")
-    write_atomic(config, yaml.safe_dump(fields).encode())
     words = ["--maps", site.map_yaml, "--init", start, "--config", config, f"--{unit}", amount, "--out", folder]
     done = subprocess.run([sys.executable, "-m", *command, *map(str, words), "--resume"])
     if done.returncode:

@@ -32,11 +32,13 @@ class Args:
     work: Path
     """Folder for adapted networks, which a repetition takes up again, and pictures of runs."""
     checkpoint: Path | None = None
-    """Network to start from; default: the one in the repository."""
+    """DSOM to start from; default: the one in the repository."""
     adapt_minutes: float | None = None
-    """Minutes of training on each map, in place of the configuration's; 0 takes the network as it is."""
+    """Minutes of training DSOM on each map, in place of the configuration's; 0 takes it as it is."""
     adapt_steps: int | None = None
     """Steps of that training in place of minutes."""
+    learn_steps: int | None = None
+    """Steps of training PF-Net and PFRNN on each map, in place of the configuration's; 0 takes them as they are."""
     runs: int | None = None
     """Monte-Carlo runs of each clip, in place of the configuration's."""
     only: tuple[str, ...] = ()
@@ -45,7 +47,8 @@ class Args:
 
 def main(args: Args) -> None:
     """All maps of a configuration."""
-    plan = read_plan(args.config, {name: getattr(args, name) for name in ("runs", "adapt_minutes", "adapt_steps")})
+    changes = ("runs", "adapt_minutes", "adapt_steps", "learn_steps")
+    plan = read_plan(args.config, {name: getattr(args, name) for name in changes})
     if not args.data.is_dir():
         raise UserError(f"--data {args.data}: no such folder; name the folder of the data set")
     if set(args.only) - set(plan.maps):
@@ -64,8 +67,11 @@ def main(args: Args) -> None:
 def start_network(plan: Plan, args: Args) -> Path | None:
     """The network that training begins with, if any method draws from one."""
     start = args.checkpoint or checkpoint.shipped()
-    if start is None and any(network_of(v.method) == "dsom" for v in variants(plan)):
+    needed = {kind for v in variants(plan) if (kind := network_of(v.method))}
+    if start is None and "dsom" in needed:
         raise UserError("--checkpoint: no network is shipped; name the folder of one")
+    if missing := [kind for kind in needed - {"dsom"} if checkpoint.shipped(kind) is None]:
+        raise UserError(f"{args.config}: methods: no {missing[0]} is shipped; leave it out")
     return start
 
 

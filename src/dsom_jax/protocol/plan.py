@@ -84,8 +84,8 @@ class Plan:
 
 def merged(given: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
     """Fields with those that ``changes`` replace; fields of fields alike."""
-    inner = {name: merged(given[name], value) for name, value in changes.items() if isinstance(given.get(name), dict)}
-    return given | changes | inner
+    both = [name for name, value in changes.items() if isinstance(value, dict) and isinstance(given.get(name), dict)]
+    return given | changes | {name: merged(given[name], changes[name]) for name in both}
 
 
 @dataclass(frozen=True)
@@ -142,6 +142,9 @@ def check_map(config: Path, name: str, fields: Any) -> None:
     """UserError unless the map called ``name`` is described by fields that :func:`map_file` can use."""
     if not isinstance(fields, Mapping) or not fields.keys() & {"yaml", "image", "drawing"}:
         raise UserError(f"{config}: maps: {name} = {fields!r}: give fields, at least yaml, image or drawing: FILE")
+    for part in ("adapt", "learn"):
+        if not isinstance(fields.get(part, {}), Mapping):
+            raise UserError(f"{config}: maps: {name}: {part} = {fields[part]!r}: give fields, or leave it out")
     if "box" not in fields:
         return
     if "drawing" not in fields or fields.get("units", "m") not in UNITS:

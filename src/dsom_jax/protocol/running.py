@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,16 +12,26 @@ from dsom_jax import bench, checkpoint, plotting, report
 from dsom_jax.data.suite import Suite
 from dsom_jax.episode import Episode
 from dsom_jax.errors import UserError
-from dsom_jax.filters.methods import COMBINATIONS, DRAWN, LEARNED, PARTS, REAL, make_filter, make_proposal, network_of
+from dsom_jax.filters.methods import (
+    COMBINATIONS,
+    DRAWN,
+    LEARNED,
+    PARTS,
+    REAL,
+    make_filter,
+    make_proposal,
+    network_of,
+    powers_of,
+)
 from dsom_jax.montecarlo import run_keys
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.proposals.dual_features import with_episode
 from dsom_jax.protocol.digests import clips_digest, map_digest
 from dsom_jax.protocol.plan import Plan, Variant
+from dsom_jax.run_folder import commit
 from dsom_jax.run_table import columns_of
 from dsom_jax.types import Filter, Proposal
 
-ROOT = Path(__file__).resolve().parents[3]
 Networks = Callable[[Variant], Path | None]
 """Folder of the network that a variant needs."""
 
@@ -33,7 +42,7 @@ class Builder:
     def __init__(self, plan: Plan, suite: Suite, networks: Networks) -> None:
         self.plan, self.suite, self.networks = plan, suite, networks
         self.made: dict[Path | None, dict[str, Proposal]] = {}
-        self.commit = commit()
+        self.commit = commit()[:7]
 
     def __call__(self, variant: Variant, grid: OccupancyGrid, episode: Episode) -> Filter:
         plan, lidar = self.plan, self.suite.lidar
@@ -91,7 +100,7 @@ def identity(variant: Variant, plan: Plan, suite: Suite, start: Path | None) -> 
         "suite": suite.name, "map_kind": plan.map_kind, "runs": plan.runs, "particles": plan.particles,
         "clips": plan.clips, "updates": plan.updates, "seed": plan.seed, "laser_max_range": plan.laser_max_range,
         "map_digest": map_digest(suite.episodes[0][1]), "clips_digest": clips_digest(suite),
-        "start_digest": start and checkpoint.digest(start),
+        "start_digest": start and checkpoint.digest(start), "powers": report.plain(powers_of(variant.method)),
     }  # fmt: skip
 
 
@@ -132,9 +141,3 @@ def draw(variant: Variant, suite: Suite, record: bench.Record, work: Path) -> No
         grid, suite.lidar, episode, record.filter, bench.moments(episode), record.result.kept.poses, estimates
     )
     plotting.save(figure, work / f"{variant.stem}.png")
-
-
-def commit() -> str:
-    """Commit of the project."""
-    command = ["git", "-C", str(ROOT), "rev-parse", "--short", "HEAD"]
-    return subprocess.run(command, capture_output=True, text=True).stdout.strip() or "unknown"
