@@ -19,6 +19,7 @@ from dsom_jax.geometry import compose, inverse, wrap_angle
 from dsom_jax.montecarlo import run, run_keys
 from dsom_jax.motion import OdometryMotion
 from dsom_jax.occupancy import from_cells
+from dsom_jax.plotting import maps
 from dsom_jax.pose_grid import cell_pose, pose_cell
 from dsom_jax.proposals.likelihood_grid import LikelihoodGridConfig, likelihood_grid
 from dsom_jax.proposals.markov_grid import MarkovGrid, MarkovGridConfig
@@ -265,6 +266,13 @@ def test_alg_1_redraws_from_all_scans_so_far(memory):
     assert (np.hypot(off[:, 0], off[:, 1]) < 0.5).mean() > 0.9
     with pytest.raises(TypeError, match="AdamRecalling: the proposal has a past"):
         filter.prepare(blind)
+
+
+def test_pictures_show_the_belief_after_the_scan(memory):
+    prepared = memory.prepare(jax.tree.map(lambda leaf: leaf[3], tiny_world.drive().inputs))
+    shown = maps._pm_of(prepared)["pm"]
+    # In units of the best cell, a peaked PM has little mass.
+    assert shown is prepared.posterior.mass and float(shown.sum()) < 0.5 * float(prepared.prior.mass.sum())
 
 
 def test_methods_with_the_memory_are_offered(memory):

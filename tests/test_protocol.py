@@ -245,6 +245,21 @@ def test_each_kind_of_network_is_trained_on_once_in_a_map(monkeypatch, tmp_path)
     assert trained == ["dsom", "pf_net", "pfrnn"] and used["pfrnn"][1] == checkpoint.digest(shipped["pfrnn"])
 
 
+@pytest.mark.parametrize(
+    ("methods", "lost", "message"),
+    [(("adam_dsom",), "dsom", "name the folder"), (("mcl", "pfrnn"), "pfrnn", "no pfrnn is shipped; leave it out"),
+     (("mcl",), "pfrnn", None)],
+)  # fmt: skip
+def test_what_methods_need_is_asked_for_before_anything_runs(monkeypatch, methods, lost, message):
+    monkeypatch.setattr(command.checkpoint, "shipped", lambda kind="dsom": None if kind == lost else Path(kind))
+    plan, args = Plan(methods=methods, t_cuts=(0.6,)), SimpleNamespace(checkpoint=None, config="c.yaml")
+    if message is None:
+        assert command.start_network(plan, args) == Path("dsom")
+        return
+    with pytest.raises(UserError, match=message):
+        command.start_network(plan, args)
+
+
 def test_networks_of_two_kinds_need_not_be_one():
     sides = {
         Variant(name, False): made_like(network={"shipped": False, "digest": name}) for name in ("pf_net", "adam_dsom")

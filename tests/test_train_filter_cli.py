@@ -134,6 +134,16 @@ def test_bad_configurations(tmp_path, text, message):
         train_filter.Arguments("pf_net").read_config(yaml.safe_load(text), "c.yaml")
 
 
+def test_scans_that_the_network_would_refuse_are_not_trained_on(files, tmp_path):
+    config = yaml.safe_load((files / "tiny.yaml").read_text())
+    config["data"]["lidar"] |= {"beams": 16, "angle_min": -1.5}
+    (tmp_path / "half.yaml").write_text(yaml.safe_dump(config))
+    given = train_filter.Arguments("pfrnn", tmp_path / "half.yaml", (files / "map.yaml",), out=tmp_path / "never")
+    with pytest.raises(UserError, match=r"half.yaml: data.lidar: field of view 180 deg, trained for 360"):
+        train_filter.open_run(given)
+    assert not given.folder.exists()
+
+
 def test_a_run_of_another_filter_is_not_resumed(tmp_path):
     create = train_filter.FilterRun(tmp_path, training("pfrnn"), (), 3)
     train_filter.create(create)

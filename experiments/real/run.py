@@ -19,6 +19,8 @@ from typing import Any
 
 import tyro
 
+from dsom_jax.run_folder import commit
+
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
 LOGS = {
@@ -101,17 +103,11 @@ def run(job: Job, args: Args, result: Path) -> str | None:
         summary = json.loads((Path(folder) / "summary.json").read_text())
     # Where the data lay on this machine is nobody's business.
     summary |= {"map": str(job.map.relative_to(args.data)), "log": str(job.log.relative_to(args.data))}
-    summary |= {"name": job.name, "commit": commit(), "load_average": os.getloadavg()[0]}
+    summary |= {"name": job.name, "commit": commit()[:7], "load_average": os.getloadavg()[0]}
     draft = result.with_suffix(".new")
     draft.write_text(json.dumps(summary, indent=2) + "\n")
     draft.replace(result)
     return None
-
-
-def commit() -> str:
-    """Commit of the project."""
-    command = ["git", "-C", str(ROOT), "rev-parse", "--short", "HEAD"]
-    return subprocess.run(command, capture_output=True, text=True).stdout.strip() or "unknown"
 
 
 def report(folder: Path) -> str:

@@ -68,8 +68,8 @@ INTRODUCTION = """\
 Eq 15 is a sum over beams, so that a particle far from the truth weighs half as much as one at it, and the particles
 neither gather at the truth nor does their mean lie there. The comparison above draws by w to the power of 8 and
 averages by w to that of 16, as if so many such scans had been seen, in all filters that weigh by Eq 15, the baselines
-included; only Alg 1 with likelihood_grid or hybrid draws as printed and averages by w to the power of 8. Trust is
-w / w* as printed. Here the same filters, maps, scans and keys with power 1 throughout, which is the paper to the
-letter."""
+included; only Alg 1 with likelihood_grid, hybrid or markov_grid draws as printed and averages by w to the power of 8.
+Trust is w / w* as printed. Here the same filters, maps, scans and keys with power 1 throughout, which is the paper to
+the letter."""
 
 PIECE = Piece(NAME, Config(), jobs, lambda _: {}, section)

@@ -90,6 +90,8 @@ def open_run(args: Arguments) -> tuple[FilterRun, Material]:
         return run, read_material(args, run)
     check_new(out, args.resume)
     config = args.read_config(read_fields(args.config), str(args.config))
+    if unfit := config.model.misfit(config.data.lidar):
+        raise UserError(f"{args.config}: data.lidar: {unfit}; give model: view: what these scans have")
     begin = None if args.init is None else args.init.name
     run = FilterRun(out, config, tuple(str(p) for p in args.maps), args.steps, init=begin)
     # Before anything is written: a bad map or checkpoint leaves no folder behind.

@@ -219,8 +219,8 @@ def make_proposal(
         likelihood, network = parts
         return Hybrid(likelihood, network, settings.hybrid)  # type: ignore[arg-type]  # as their names say
     if name == "markov_grid":
-        grown = (made or {}).get("likelihood_grid") or make_proposal("likelihood_grid", grid, lidar, settings)
-        return remembering(grown, settings)  # type: ignore[arg-type]  # as its name says
+        single = (made or {}).get("likelihood_grid") or make_proposal("likelihood_grid", grid, lidar, settings)
+        return remembering(single, settings)  # type: ignore[arg-type]  # as its name says
     if name == "dual_features":
         return dual_features(jax.random.key(settings.seed), grid, lidar, DualFeaturesConfig())
     raise ValueError(f"make_proposal: no proposal is called {name!r}")
