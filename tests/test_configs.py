@@ -41,7 +41,9 @@ WRONG: dict[type, tuple[dict, dict]] = {
         "range_max": (0.0, INF, NAN), "mount": ((0.0, 0.0), (0.0, NAN, 0.0)),
     }),
     LidarNoise: ({}, {"sigma": (-0.1, NAN), "sigma_relative": (-1.0,), "dropout": (1.5, -0.1), "short": (2.0, NAN)}),
-    RaycastConfig: ({}, {"method": ("fast",), "angles": (3,), "max_skip": (0, 256), "surface": (-1.0, NAN)}),
+    RaycastConfig: ({}, {
+        "method": ("fast",), "angles": (3,), "max_skip": (0, 256), "surface": (-1.0, NAN), "viewpoints": (0, 1.5),
+    }),
     ScoreModel: ({}, {
         "sigma": (0.0, NAN), "alpha": (-0.1,), "beta": (-0.1,), "range_max": (0.0, INF), "power": (0, 1.5),
     }),
@@ -61,6 +63,7 @@ WRONG: dict[type, tuple[dict, dict]] = {
     FilterConfig: ({}, {
         "particles": (0, -5, 1.5), "predecessor": ("nearest",), "resampling": ("none",), "weight_power": (0.0, NAN),
         "estimate_power": (0.0, NAN),
+        "estimate_by": ("truth",),
     }),
     MCL: (FILTER, {"injection": (-0.1, 1.1, NAN)}),
     MixtureMCL: (SHARED, {"p": (-0.1, 1.1, NAN)}),

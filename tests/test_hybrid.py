@@ -12,14 +12,27 @@ import pytest
 
 import tiny_world
 from dsom_jax import pose_grid as pg
-from dsom_jax.filters.methods import LEARNED, METHODS, Settings, make_filter, make_proposal, powers_of
+from dsom_jax.filters.adam import AdamRecalling
+from dsom_jax.filters.adam_memory import AdamMemory
+from dsom_jax.filters.methods import (
+    LEARNED,
+    METHODS,
+    STANDARD,
+    Settings,
+    build_filter,
+    make_filter,
+    make_proposal,
+    network_of,
+    powers_of,
+)
 from dsom_jax.geometry import compose
 from dsom_jax.nn import DSOMConfig, create, evaluation_view
 from dsom_jax.occupancy import is_free, resample
 from dsom_jax.proposals.dsom import dsom
 from dsom_jax.proposals.hybrid import Hybrid, HybridConfig, interpolate_headings
 from dsom_jax.proposals.likelihood_grid import LikelihoodGridConfig, likelihood_grid
-from dsom_jax.proposals.markov_grid import MarkovGrid
+from dsom_jax.proposals.markov_grid import MarkovGrid, MarkovGridConfig
+from dsom_jax.proposals.markov_network import MarkovNetwork
 from dsom_jax.proposals.uniform import free_space
 from dsom_jax.sensor import BeamModel
 from dsom_jax.types import Inputs
@@ -141,26 +154,52 @@ def test_powers_of_methods_are_those_of_their_filters():
         *LEARNED, *(name for name in METHODS if name.startswith("robust_"))
     }  # fmt: skip
     assert {name for name, powers in found.items() if powers == (1.0, 8.0)} == {
-        "adam_likelihood_grid", "adam_hybrid", "adam_markov_grid"
+        "adam_likelihood_grid", "adam_hybrid", "adam_markov_grid", "adam_markov_dsom"
     }  # fmt: skip
     assert found["adam_dsom"] == found["mcl"] == found["mixture_mcl_star"] == (8.0, 16.0)
     assert powers_of("adam_dsom", 1.0) == (1.0, 1.0)
+
+
+def test_a_memory_of_the_network_multiplies_its_maps_along_the_drive(parts):
+    """A robot that stands still and sees two scans: PM of both, each to the power, times each other."""
+    still = MarkovGridConfig(kidnap=1e-12, slip=0.0)
+    memory = MarkovNetwork(parts[0], still, network=parts[1], power=0.4, floor=0.02)
+    scans = [Inputs(tiny_world.drive().ranges[t], jnp.full(3, jnp.nan), jnp.int32(n)) for n, t in enumerate((3, 9))]
+    belief, expected = memory.begin(), 1.0
+    for scan in scans:
+        prepared, belief = memory.recall(belief, scan)
+        log_pm = Hybrid(*parts, HybridConfig(floor=0.02)).log_network(scan)
+        expected = expected * np.exp(0.4 * np.asarray(log_pm, np.float64))
+    expected = np.where(np.asarray(memory.begin()) > 0, expected, 0.0)
+    np.testing.assert_allclose(belief, expected / expected.sum(), rtol=1e-3, atol=1e-9)
+    poses, log_density = memory.sample(jax.random.key(0), prepared, 50)
+    np.testing.assert_allclose(memory.likelihood.log_density(prepared.posterior, poses), log_density, rtol=1e-4)
+
+
+def test_filters_that_remember_what_the_network_said_are_offered(parts):
+    made = {"likelihood_grid": parts[0], "dsom": parts[1]}
+    for name, kind in (("adam_markov_dsom", AdamRecalling), ("robust_markov_dsom", AdamMemory)):
+        assert network_of(name) == "dsom" and name not in STANDARD
+        built = build_filter(name, tiny_world.grid(), LIDAR, particles=20, t_cut=0.6, sources=made)
+        assert isinstance(built, kind) and isinstance(built.proposal, MarkovNetwork)
+        assert built.proposal.power == Settings().memory_network
 
 
 def test_power_one_is_as_printed():
     for name in ("adam", "mixture_mcl", "mcl"):
         source, settings = free_space(tiny_world.grid()), Settings(weight_power=1.0)
         config = make_filter(name, source, tiny_world.grid(), LIDAR, settings).config
-        assert (config.weight_power, config.estimate_power) == (1.0, 1.0)
+        assert (config.weight_power, config.estimate_power, config.estimate_by) == (1.0, 1.0, "weight")
 
 
 @pytest.mark.parametrize("exact", [True, False])
-def test_alg_1_draws_as_printed_from_an_exact_likelihood_only(parts, exact):
+def test_alg_1_draws_as_printed_from_what_is_as_good_as_sure_only(parts, exact):
     """All else draws by Eq 15 to the power, and averages by a higher one."""
     settings = Settings(weight_power=8.0, grid=GRID)
-    memory = MarkovGrid(parts[0])
-    for source in (parts[0], Hybrid(*parts, HybridConfig()), memory) if exact else (parts[1],):
+    memories = MarkovGrid(parts[0]), MarkovNetwork(parts[0], network=parts[1])
+    for source in (parts[0], Hybrid(*parts, HybridConfig()), *memories) if exact else (parts[1],):
         for name in ("adam", "mixture_mcl", "mcl"):
             config = make_filter(name, source, tiny_world.grid(), LIDAR, settings).config
             drawn, averaged = (1.0, 8.0) if exact and name == "adam" else (8.0, 16.0)
             assert (config.weight_power, config.estimate_power) == (drawn, averaged)
+            assert config.estimate_by == "likelihood"

@@ -25,14 +25,15 @@ COMPARED = ("mcl", "mixture_mcl", "mixture_mcl_star", "pfrnn", "pf_net", "adam_d
 ABLATED = ("mcl", "mixture_mcl_star", "mixture_mcl_dsom", "adam_dsom", "adam_likelihood_grid", "adam_hybrid",
            "adam_markov_grid", "robust_dsom", "robust_likelihood_grid", "robust_hybrid")  # fmt: skip
 """The paper's ablation, then what is ours."""
+OTHERS = ("robust_markov_grid", "adam_markov_dsom", "robust_markov_dsom")
 
 
 @dataclass(frozen=True)
 class Config:
     """Attributes: methods; runs of each on each sequence; particles; T_cut of Alg 1; powers of Eq 15."""
 
-    # AdaM robust with a memory is what localize runs; here proposals are compared in one filter.
-    methods: tuple[str, ...] = tuple(name for name in METHODS if name != "robust_markov_grid")
+    # AdaM robust with a memory is what localize runs, and DSOM with one is for floor plans.
+    methods: tuple[str, ...] = tuple(name for name in METHODS if name not in OTHERS)
     runs: int = 100
     particles: int = 200
     t_cut: float = 0.6

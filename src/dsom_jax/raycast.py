@@ -1,7 +1,7 @@
 """Ray casting on an occupancy grid: exact by empty-square skipping, or looked up in a precomputed table.
 
 Accuracy and speed of both are measured by ``experiments/perf/raycast.py``; the worst case of the table is at the
-edges of obstacles, where the ray from the pose and the one from the centre of its cell meet different walls.
+edges of obstacles, where the ray from the pose and the one from the nearest viewpoint meet different walls.
 """
 
 from __future__ import annotations
@@ -27,9 +27,11 @@ class RaycastConfig:
     """How expected ranges are obtained.
 
     Attributes:
-        method: ``exact`` marches every ray; ``table`` looks up the wall that the ray from the centre of the cell, at
+        method: ``exact`` marches every ray; ``table`` looks up the wall that the ray from the nearest viewpoint, at
             the nearest of ``angles`` directions, would meet, and intersects the actual ray with that wall.
-        angles: directions per cell of the table.
+        angles: directions of the table.
+        viewpoints: of the table, per side of a cell; time and memory of the table grow with their square. 1 is the
+            centre of the cell.
         max_skip: side of the largest empty square stored, cells.
         surface: how deep in an occupied cell the beam is returned, cells. 0 for worlds whose cells are solid; 0.5 for
             maps made from scans, whose end points lie anywhere in the cells that they fill.
@@ -39,11 +41,12 @@ class RaycastConfig:
     angles: int = 360
     max_skip: int = 63
     surface: float = 0.0
+    viewpoints: int = 1
 
     def __post_init__(self) -> None:
         checks.choice(self, "method", ("exact", "table"))
         checks.count(self, "angles", 4)
-        checks.count(self, "max_skip")
+        checks.count(self, "max_skip viewpoints")
         checks.within(self, "max_skip", 1, 255, "give 1 to 255 cells")
         checks.not_negative(self, "surface")
 
@@ -57,8 +60,8 @@ class MapTables:
         grid: the map.
         squares: (4, H + 2, W + 2) uint8, side of the largest empty square whose corner is the cell and that extends
             to -x-y, +x-y, -x+y, +x+y; zero on occupied cells and on a border one cell wide around the map.
-        walls: (H, W, A) int16 or None, first wall from the centre of the cell: 2 * coordinate + axis, -1 for none,
-            -2 on occupied cells.
+        walls: (V H, V W, A) int16 or None, first wall from each of V x V viewpoints in a cell: 2 * coordinate + axis,
+            -1 for none, -2 on occupied cells.
         range_max: metres up to which ``walls`` was computed (static).
         surface: metres added to the distance of the near edge of an occupied cell (static).
     """
@@ -77,14 +80,15 @@ def make_tables(grid: OccupancyGrid, config: RaycastConfig, range_max: float) ->
     Raises:
         UserError: the map is too large for ``table``, whose entries are counted in int32 and name walls in int16.
     """
-    if config.method == "table" and (grid.occupied.size * config.angles >= 2**31 or max(grid.shape) >= 2**14):
+    entries = grid.occupied.size * config.viewpoints**2 * config.angles
+    if config.method == "table" and (entries >= 2**31 or max(grid.shape) >= 2**14):
         cells, angles = "x".join(map(str, grid.shape)), config.angles
         raise UserError(f"map of {cells} cells is too large for a table of {angles} angles; use method exact")
     squares = empty_squares(jnp.pad(grid.occupied, 1, constant_values=True), config.max_skip)
     tables = MapTables(grid, squares, None, range_max, config.surface * grid.resolution)
     if config.method == "exact":
         return tables
-    return replace(tables, walls=_first_walls(tables, config.angles))
+    return replace(tables, walls=_first_walls(tables, config.angles, config.viewpoints))
 
 
 def cast_rays(tables: MapTables, poses: Array, lidar: LidarConfig) -> Array:
@@ -99,7 +103,8 @@ def cast_rays(tables: MapTables, poses: Array, lidar: LidarConfig) -> Array:
     if tables.walls is None:
         reach = march(tables.squares, x, y, sensor[..., 2], bearings, limit)
     else:
-        reach = _meet_walls(tables.walls, x[..., None], y[..., None], sensor[..., 2], bearings)
+        viewpoints = tables.walls.shape[0] // tables.grid.shape[0]
+        reach = _meet_walls(tables.walls, viewpoints, x[..., None], y[..., None], sensor[..., 2], bearings)
     reach = reach * tables.grid.resolution + tables.surface
     return jnp.where(reach < lidar.range_max, reach, jnp.inf)
 
@@ -110,34 +115,36 @@ def _directions(theta: Array, bearings: Array) -> tuple[Array, Array]:
     return turned(c, s, jnp.cos(bearings), jnp.sin(bearings))
 
 
-def _first_walls(tables: MapTables, angles: int) -> Array:
-    """(H, W, A) int16 walls seen from cell centres: 2 * coordinate of the cell edge hit + (0 across x, 1 across y).
+def _first_walls(tables: MapTables, angles: int, viewpoints: int) -> Array:
+    """(V H, V W, A) int16 walls seen from the viewpoints: 2 * coordinate of the edge hit + (0 across x, 1 across y).
 
     -1 for none; -2 on occupied cells, from which everything is at distance zero.
     """
-    height, width = tables.grid.shape
+    height, width = (side * viewpoints for side in tables.grid.shape)
     theta = jnp.arange(angles) * (2 * jnp.pi / angles)
     dx, dy = jnp.cos(theta), jnp.sin(theta)
     limit = tables.range_max / tables.grid.resolution + 1.0
+    occupied = jnp.repeat(jnp.repeat(tables.grid.occupied, viewpoints, 0), viewpoints, 1)
 
     def one_row(i: Array) -> Array:
-        x, y = jnp.arange(width) + 0.5, i + 0.5
+        x, y = (jnp.arange(width) + 0.5) / viewpoints, (i + 0.5) / viewpoints
         reach = march(tables.squares, x, jnp.full(width, y), jnp.zeros(width), theta, limit)
         at_x, at_y = x[:, None] + reach * dx, y + reach * dy
         across_y = jnp.abs(at_y - jnp.round(at_y)) < jnp.abs(at_x - jnp.round(at_x))
         edge = jnp.round(jnp.where(across_y, at_y, at_x))
         walls = jnp.where(jnp.isfinite(reach), 2 * edge + across_y, -1).astype(jnp.int16)
-        return jnp.where(tables.grid.occupied[i.astype(jnp.int32), :, None], jnp.int16(-2), walls)
+        return jnp.where(occupied[i.astype(jnp.int32), :, None], jnp.int16(-2), walls)
 
     return jax.lax.map(one_row, jnp.arange(height), batch_size=16)
 
 
-def _meet_walls(walls: Array, x: Array, y: Array, theta: Array, bearings: Array) -> Array:
+def _meet_walls(walls: Array, viewpoints: int, x: Array, y: Array, theta: Array, bearings: Array) -> Array:
     """Distance in cells along the actual rays to the tabulated wall, inf for none."""
     height, width, angles = walls.shape
     dx, dy = _directions(theta, bearings)
-    known = inside((height, width), y, x) & jnp.isfinite(theta)[..., None]
-    i, j = (jnp.where(known, jnp.floor(v), 0.0) for v in (y, x))
+    row, column = y * viewpoints, x * viewpoints
+    known = inside((height, width), row, column) & jnp.isfinite(theta)[..., None]
+    i, j = (jnp.where(known, jnp.floor(v), 0.0) for v in (row, column))
     cell = flat_index(i, j, (height, width)) * angles
     turns = (theta[..., None] + bearings) * (angles / (2 * jnp.pi))
     bins = jnp.round(jnp.where(known, turns, 0.0)).astype(jnp.int32) % angles

@@ -10,7 +10,7 @@ import numpy as np
 
 from dsom_jax import checks
 from dsom_jax.filters.common import Info, ParticleState
-from dsom_jax.filters.updates import Draw, FilterConfig, World, mcl_update, mix, start
+from dsom_jax.filters.updates import Draw, FilterConfig, World, conclude, resample_and_move, start
 from dsom_jax.types import Array, Inputs, Key
 
 
@@ -45,17 +45,16 @@ class MCL:
         _, k_update = jax.random.split(key)
         k_high, k_fresh, _ = jax.random.split(k_update, 3)
         everyone = jnp.ones(self.config.particles, bool)
-        moved = mcl_update(k_high, state, everyone, inputs, self.world, self.config)
+        moved = resample_and_move(k_high, state, everyone, inputs, self.world, self.config)
         fresh, _ = self.world.space.sample(k_fresh, None, self.config.particles)
-        moved = self._inject(moved, fresh, inputs)
-        return mix(state, everyone, moved, moved, fresh, self.config)
+        poses = self._inject(moved, fresh)
+        weights = self.world.weigh(poses, inputs.ranges)
+        return conclude(state, Draw(poses, weights, weights), jnp.float32(0.0), fresh, self.config)
 
-    def _inject(self, draw: Draw, fresh: Array, inputs: Inputs) -> Draw:
+    def _inject(self, poses: Array, fresh: Array) -> Array:
         """Random particles in place of evenly spaced ones (neighbours in the set share an ancestor)."""
         count = round(self.injection * self.config.particles)
         if count == 0:
-            return draw
+            return poses
         slots = np.linspace(0, self.config.particles, count, endpoint=False).astype(np.int32)
-        fresh = fresh[:count]
-        weights = self.world.weigh(fresh, inputs.ranges)
-        return Draw(draw.poses.at[slots].set(fresh), draw.weights.at[slots].set(weights))
+        return poses.at[slots].set(fresh[:count])

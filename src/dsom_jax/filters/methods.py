@@ -17,7 +17,7 @@ from dsom_jax.filters.mcl import MCL
 from dsom_jax.filters.mixture import MixtureMCL
 from dsom_jax.filters.pf_net import pf_net
 from dsom_jax.filters.pfrnn import pfrnn
-from dsom_jax.filters.updates import FilterConfig, World
+from dsom_jax.filters.updates import Estimate, FilterConfig, World
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.motion import OdometryMotion
 from dsom_jax.occupancy import OccupancyGrid
@@ -26,6 +26,7 @@ from dsom_jax.proposals.dual_features import DualFeaturesConfig, dual_features, 
 from dsom_jax.proposals.hybrid import Hybrid, HybridConfig
 from dsom_jax.proposals.likelihood_grid import LikelihoodGrid, LikelihoodGridConfig, likelihood_grid
 from dsom_jax.proposals.markov_grid import MarkovGrid, MarkovGridConfig
+from dsom_jax.proposals.markov_network import MarkovNetwork
 from dsom_jax.proposals.uniform import free_space
 from dsom_jax.raycast import RaycastConfig, make_tables
 from dsom_jax.sensor import BeamModel, ScoreModel
@@ -42,18 +43,29 @@ COMBINATIONS: dict[str, tuple[Algorithm, str]] = {
     "adam_likelihood_grid": ("adam", "likelihood_grid"),
     "adam_hybrid": ("adam", "hybrid"),
     "adam_markov_grid": ("adam", "markov_grid"),
+    "adam_markov_dsom": ("adam", "markov_dsom"),
     "robust_dsom": ("adam_robust", "dsom"),
     "robust_likelihood_grid": ("adam_robust", "likelihood_grid"),
     "robust_hybrid": ("adam_robust", "hybrid"),
     "robust_markov_grid": ("adam_robust", "markov_grid"),
+    "robust_markov_dsom": ("adam_robust", "markov_dsom"),
 }
 LEARNED: dict[str, Callable[..., Filter]] = {"pf_net": pf_net, "pfrnn": pfrnn}
 """Filters that are networks themselves; each has the name of its kind of network."""
 _STAR = "_star"
-PARTS = {"hybrid": ("likelihood_grid", "dsom"), "markov_grid": ("likelihood_grid",)}
-EXACT_TYPES: dict[type, str] = {LikelihoodGrid: "likelihood_grid", Hybrid: "hybrid", MarkovGrid: "markov_grid"}
-EXACT = frozenset(EXACT_TYPES.values())
-"""Proposals that hold the exact likelihood of a scan."""
+PARTS = {
+    "hybrid": ("likelihood_grid", "dsom"),
+    "markov_grid": ("likelihood_grid",),
+    "markov_dsom": ("likelihood_grid", "dsom"),
+}
+SURE_TYPES: dict[type, str] = {
+    LikelihoodGrid: "likelihood_grid",
+    Hybrid: "hybrid",
+    MarkovGrid: "markov_grid",
+    MarkovNetwork: "markov_dsom",
+}
+SURE = frozenset(SURE_TYPES.values())
+"""Proposals that hold the exact likelihood of a scan, or what all scans so far say."""
 METHODS: tuple[str, ...] = (*COMBINATIONS, *LEARNED)
 STANDARD: tuple[str, ...] = tuple(name for name, (_, proposal) in COMBINATIONS.items() if proposal not in PARTS)
 """Methods of the standard comparison; the others have to be asked for by name."""
@@ -74,11 +86,11 @@ def powers(algorithm: str, source: str, weight_power: float) -> tuple[float, flo
     """Powers of Eq 15 by which a filter that weighs by it draws and averages; ``source`` is its proposal.
 
     Draws have to leave room for places that are only likely, an average has not: it goes by 16 where draws go by 8,
-    and by 1, as printed, where they do (experiments/dsom/REPORT.md). Alg 1 with an exact likelihood as its proposal
+    and by 1, as printed, where they do (experiments/dsom/REPORT.md). Alg 1 with one of :data:`SURE` as its proposal
     draws as printed and averages by ``weight_power``: PM then is as good as sure, and what gathers sooner than PM
     arrives stays at a wrong place that looks alike.
     """
-    if algorithm == "adam" and source in EXACT:
+    if algorithm == "adam" and source in SURE:
         return 1.0, weight_power
     return weight_power, round(weight_power ** (4 / 3), 9)
 
@@ -102,7 +114,8 @@ class Settings:
         motion, score, raycast: drive, Eq 15 and expected ranges of the paper's filters.
         weight_power: particles are drawn by Eq 15 to this power, as if so many such scans had been seen; 1 as printed,
             where a particle elsewhere weighs half as much as one at the truth (experiments/REPORT.md). Estimates
-            average by another, and Alg 1 with an exact likelihood is an exception: :func:`powers`.
+            average by another, and Alg 1 with some proposals is an exception: :func:`powers`. Unless it is 1, an
+            estimate goes by what the scan says of a redrawn pose itself, not by what that pose has inherited.
         grid: the likelihood grid.
         sharpness: exponent of DSOM's PM in the paper's filters (``experiments/dsom``).
         hybrid: weights of likelihood grid and network.
@@ -112,7 +125,8 @@ class Settings:
         memory_share: least and greatest weight of what that memory says, beside the particles' own past.
         memory_temper: factor on a scan's log-likelihood in that memory, in place of the grid's own: where the map is
             wrong, scans taken one after another err alike.
-        markov: how that memory moves.
+        memory_network: exponent of DSOM's PM in a memory of such maps.
+        markov: how these memories move.
     """
 
     particles: int = 200
@@ -121,7 +135,7 @@ class Settings:
     seed: int = 0
     motion: Motion = OdometryMotion()
     score: ScoreModel = ScoreModel()
-    raycast: RaycastConfig = RaycastConfig("table")
+    raycast: RaycastConfig = RaycastConfig("table", angles=180, viewpoints=2)
     grid: LikelihoodGridConfig = LikelihoodGridConfig()
     weight_power: float = WEIGHT_POWER
     sharpness: float = 3.0
@@ -133,6 +147,7 @@ class Settings:
     memory: bool = False
     memory_share: tuple[float, float] = (0.01, 0.5)
     memory_temper: float = 0.05
+    memory_network: float = 0.3
     markov: MarkovGridConfig = MarkovGridConfig()
 
     def __post_init__(self) -> None:
@@ -140,7 +155,7 @@ class Settings:
         checks.count(self, "seed", 0)
         checks.share(self, "t_cut")
         checks.span(self, "memory_share")
-        checks.positive(self, "weight_power sharpness robust_sharpness memory_temper")
+        checks.positive(self, "weight_power sharpness robust_sharpness memory_temper memory_network")
 
 
 _SCANNED = 1.0
@@ -213,11 +228,13 @@ def make_proposal(
         return likelihood_grid(grid, lidar, replace(settings.grid, model=model))
     if name == "dsom":
         return dsom(checkpoint, grid, lidar, settings.sharpness, settings.raycast.surface)
-    if name == "hybrid":
+    if name in ("hybrid", "markov_dsom"):
         have = made or {}
         parts = (have.get(p) or make_proposal(p, grid, lidar, settings, checkpoint) for p in PARTS[name])
-        likelihood, network = parts
-        return Hybrid(likelihood, network, settings.hybrid)  # type: ignore[arg-type]  # as their names say
+        likelihood, network = parts  # type: Any, Any  # as their names say
+        if name == "hybrid":
+            return Hybrid(likelihood, network, settings.hybrid)
+        return MarkovNetwork(likelihood, settings.markov, network=network, power=settings.memory_network)
     if name == "markov_grid":
         single = (made or {}).get("likelihood_grid") or make_proposal("likelihood_grid", grid, lidar, settings)
         return remembering(single, settings)  # type: ignore[arg-type]  # as its name says
@@ -252,8 +269,9 @@ def make_filter(
     score = replace(settings.score, range_max=lidar.range_max)
     tables = make_tables(grid, settings.raycast, lidar.range_max)
     world = World(tables, space, used, step, settings.motion, score)
-    drawn, averaged = powers(algorithm, EXACT_TYPES.get(type(proposal), ""), settings.weight_power)
-    config = FilterConfig(settings.particles, weight_power=drawn, estimate_power=averaged)
+    drawn, averaged = powers(algorithm, SURE_TYPES.get(type(proposal), ""), settings.weight_power)
+    judge: Estimate = "weight" if averaged == 1 else "likelihood"
+    config = FilterConfig(settings.particles, weight_power=drawn, estimate_power=averaged, estimate_by=judge)
     if algorithm == "mcl":
         return MCL(world, config)
     if algorithm == "mixture_mcl":

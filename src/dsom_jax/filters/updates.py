@@ -18,6 +18,7 @@ from dsom_jax.sensor import ScoreModel, beam_score, perfect_score
 from dsom_jax.types import Array, Inputs, Key, Motion, Proposal
 
 Predecessor = Literal["knn", "motion"]
+Estimate = Literal["weight", "likelihood"]
 _NEIGHBOURS = 3
 
 
@@ -32,6 +33,8 @@ class FilterConfig:
         resampling: scheme for the MCL part.
         weight_power: w_norm, by which particles are drawn, is proportional to w to this power; trust is w itself.
         estimate_power: the same for the estimates. Both are 1 in the paper.
+        estimate_by: what estimates average by: the particle's ``weight``, as in the paper, or the ``likelihood`` w of
+            the pose itself, where a redrawn particle's weight is its predecessor's.
     """
 
     particles: int = 200
@@ -39,12 +42,14 @@ class FilterConfig:
     resampling: Resampling = "systematic"
     weight_power: float = 1.0
     estimate_power: float = 1.0
+    estimate_by: Estimate = "weight"
 
     def __post_init__(self) -> None:
         checks.count(self, "particles")
         checks.positive(self, "weight_power estimate_power")
         checks.choice(self, "predecessor", get_args(Predecessor))
         checks.choice(self, "resampling", get_args(Resampling))
+        checks.choice(self, "estimate_by", get_args(Estimate))
 
 
 @jax.tree_util.register_dataclass
@@ -75,10 +80,11 @@ class World:
 
 
 class Draw(NamedTuple):
-    """Poses (N, 3) and raw weights (N,) of one branch."""
+    """Poses (N, 3), raw weights w (N,) and p(o | s) of the poses themselves (N,), in units of w*, too."""
 
     poses: Array
     weights: Array
+    likelihood: Array
 
 
 def start(key: Key, world: World, config: FilterConfig) -> ParticleState:
@@ -100,17 +106,16 @@ def masked_ancestors(key: Key, normalised: Array, member: Array, method: Resampl
     return pick(cumulative, (rank % count + jax.random.uniform(key)) / count)
 
 
-def mcl_update(
+def resample_and_move(
     key: Key, state: ParticleState, member: Array, inputs: Inputs, world: World, config: FilterConfig
-) -> Draw:
-    """Sample h from H by w_norm, move it, weigh it (Alg 1, lines 10 to 14)."""
+) -> Array:
+    """Poses (N, 3): sample h from H by w_norm, move it (Alg 1, lines 10 to 12)."""
     k_resample, k_move = jax.random.split(key)
     ancestors = masked_ancestors(k_resample, state.normalised, member, config.resampling)
-    poses = world.motion.sample(k_move, state.poses[ancestors], inputs.odometry)
-    return Draw(poses, world.weigh(poses, inputs.ranges))
+    return world.motion.sample(k_move, state.poses[ancestors], inputs.odometry)
 
 
-def dual_update(
+def redraw(
     key: Key,
     state: ParticleState,
     inputs: Inputs,
@@ -118,8 +123,8 @@ def dual_update(
     proposal: Proposal,
     prepared: Any,
     config: FilterConfig,
-) -> Draw:
-    """Sample l' from PM and give it the weight of a predecessor (Alg 1, lines 15 to 19)."""
+) -> tuple[Array, Array]:
+    """Sample l' (N, 3) from PM and give it the weight (N,) of a predecessor (Alg 1, lines 15 to 19)."""
     k_draw, k_move, k_match = jax.random.split(key, 3)
     poses, _ = proposal.sample(k_draw, prepared, config.particles)
     if config.predecessor == "motion":
@@ -127,7 +132,7 @@ def dual_update(
         parents = _by_motion(k_match, log_match)
     else:
         parents = _by_distance(k_match, poses, world.motion.sample(k_move, state.poses, inputs.odometry))
-    return Draw(poses, state.weights[parents])
+    return poses, state.weights[parents]
 
 
 def _by_motion(key: Key, log_match: Array) -> Array:
@@ -167,22 +172,29 @@ def _nearest(poses: Array, others: Array, count: int) -> tuple[Array, Array]:
 
 def powered(weights: Array, power: float) -> Array:
     """Weights (N,) to a power, normalised; taken in units of the largest, as powers of small numbers vanish."""
-    return normalise(weights if power == 1 else (weights / weights.max()) ** power)
+    if power == 1:
+        return normalise(weights)
+    largest = weights.max()
+    return normalise((weights / jnp.where(largest > 0, largest, 1.0)) ** power)
 
 
-def mix(
-    state: ParticleState, high: Array, trusted: Draw, redrawn: Draw, spare: Array, config: FilterConfig
+def conclude(
+    state: ParticleState, draw: Draw, redrawn: Array, spare: Array, config: FilterConfig
 ) -> tuple[ParticleState, Info]:
-    """P_t of the two branches; if every weight has vanished, the poses ``spare`` (N, 3) take over (flagged in Info).
+    """P_t and what it says; if every weight has vanished, the poses ``spare`` (N, 3) take over (flagged in Info).
 
     They are trusted for one update, or none of them would ever be weighed.
     """
-    poses = jnp.where(high[:, None], trusted.poses, redrawn.poses)
-    weights = jnp.where(high, trusted.weights, redrawn.weights)
-    dead = ~(weights.sum() > 0)
-    poses = jnp.where(dead, spare, poses)
-    weights = jnp.where(dead, 1.0, weights)
-    info = describe(poses, powered(weights, config.estimate_power), 1.0 - high.mean(), dead)
+    dead = ~(draw.weights.sum() > 0)
+    poses = jnp.where(dead, spare, draw.poses)
+    weights = jnp.where(dead, 1.0, draw.weights)
+    if config.estimate_by == "likelihood":
+        # No beam of any particle may fit: what they inherited is then all that is known.
+        fits = ~dead & (draw.likelihood.sum() > 0)
+        judged = jnp.where(fits, draw.likelihood, weights)
+    else:
+        judged = weights
+    info = describe(poses, powered(judged, config.estimate_power), redrawn, dead)
     return ParticleState(poses, weights, powered(weights, config.weight_power), state.updates + 1), info
 
 
@@ -198,9 +210,12 @@ def mixture_update(
 ) -> tuple[ParticleState, Info]:
     """MCL update of the particles ``high`` (N,), dual MCL update of the others (Alg 1, lines 10 to 21)."""
     k_high, k_low = jax.random.split(key)
-    trusted = mcl_update(k_high, state, high, inputs, world, config)
-    redrawn = dual_update(k_low, state, inputs, world, proposal, prepared, config)
-    return mix(state, high, trusted, redrawn, redrawn.poses, config)
+    kept = resample_and_move(k_high, state, high, inputs, world, config)
+    redrawn, inherited = redraw(k_low, state, inputs, world, proposal, prepared, config)
+    poses = jnp.where(high[:, None], kept, redrawn)
+    likelihood = world.weigh(poses, inputs.ranges)
+    draw = Draw(poses, jnp.where(high, likelihood, inherited), likelihood)
+    return conclude(state, draw, 1.0 - high.mean(), redrawn, config)
 
 
 @dataclass(frozen=True)

@@ -61,23 +61,28 @@ class Hybrid:
         return self.likelihood.probability_map(evidence + learnt)
 
     def log_network(self, inputs: Inputs) -> Array:
-        """(C, K) log of DSOM's own probability (not sharpened), with its floor, at the cells of the likelihood grid."""
-        network = self.network.pose_grid
-        even = self.config.floor / jnp.maximum(self.network.free.sum() * network.headings, 1)
-        log_pm = jnp.log((1 - self.config.floor) * pg.exp_or_zero(self.network.log_map(inputs)) + even)
-        layers = jnp.moveaxis(log_pm, -1, 0).reshape(network.headings, -1)
-        grid, x, y = self.likelihood.pose_grid, *self.likelihood.lidar.mount[:2]
-        i, j = jnp.divmod(jnp.minimum(self.likelihood.cells, self.free.size - 1), grid.width)
-
-        def one_heading(k: Array) -> Array:
-            sensor = pg.cell_pose(grid, i, j, jnp.broadcast_to(k, i.shape))
-            return interpolate_headings(layers, network, compose(sensor, jnp.array([-x, -y, 0.0])))
-
-        return jax.lax.map(one_heading, jnp.arange(grid.headings)).T
+        """(C, K) of :func:`log_network` with this pool's floor."""
+        return log_network(self.network, self.likelihood, inputs, self.config.floor)
 
     def sample(self, key: Key, prepared: pg.ProbabilityMap, n: int) -> tuple[Array, Array]:
         """``n`` base poses (n, 3) from PM and their log densities."""
         return self.likelihood.sample(key, prepared, n)
+
+
+def log_network(network: DSOMProposal, likelihood: LikelihoodGrid, inputs: Inputs, floor: float) -> Array:
+    """(C, K) log of DSOM's own probability (not sharpened), with its floor, at the cells of the likelihood grid."""
+    theirs = network.pose_grid
+    even = floor / jnp.maximum(network.free.sum() * theirs.headings, 1)
+    log_pm = jnp.log((1 - floor) * pg.exp_or_zero(network.log_map(inputs)) + even)
+    layers = jnp.moveaxis(log_pm, -1, 0).reshape(theirs.headings, -1)
+    grid, x, y = likelihood.pose_grid, *likelihood.lidar.mount[:2]
+    i, j = jnp.divmod(jnp.minimum(likelihood.cells, likelihood.free.size - 1), grid.width)
+
+    def one_heading(k: Array) -> Array:
+        sensor = pg.cell_pose(grid, i, j, jnp.broadcast_to(k, i.shape))
+        return interpolate_headings(layers, theirs, compose(sensor, jnp.array([-x, -y, 0.0])))
+
+    return jax.lax.map(one_heading, jnp.arange(grid.headings)).T
 
 
 def interpolate_headings(layers: Array, grid: pg.PoseGrid, poses: Array) -> Array:

@@ -76,10 +76,14 @@ class MarkovGrid:
         moved = jnp.where(still, belief, self.predict(belief, jnp.where(known, inputs.odometry, 0.0)))
         prior = (1 - self.config.kidnap) * normalised(moved) + self.config.kidnap * self.begin()
         log_prior = jnp.log(prior)
-        log_posterior = log_prior + self.likelihood.log_likelihood(inputs.ranges)
+        log_posterior = log_prior + self.evidence(inputs)
         posterior = pg.exp_or_zero(log_posterior - log_posterior.max())
         maps = (self.likelihood.probability_map(v) for v in (log_prior, log_posterior))
         return Recollection(*maps), normalised(posterior)
+
+    def evidence(self, inputs: Inputs) -> Array:
+        """(C, K) what one scan says: the tempered log-likelihood."""
+        return self.likelihood.log_likelihood(inputs.ranges)
 
     def prepare(self, inputs: Inputs) -> Recollection:
         """PMs of a scan taken for the first one: without memory, whatever was seen before."""
