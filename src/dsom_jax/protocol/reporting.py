@@ -38,8 +38,9 @@ Every clip starts without any prior on the pose; at its end the robot is carried
 - sure and wrong: updates at which the filter claims to know (lost < 5 %) and is not within 2 m and 10 deg
 - the paper's filters are judged by the weighted mean of the particles, robust ones by the heaviest cluster
 - network: as shipped, or trained on in this map for so long
-- `adam_markov_grid` and `robust_likelihood_grid` draw from what all scans so far say, as `localize` does; the other
-  `adam_*`, `robust_*` and `mixture_*` from what the last one says
+- `*_markov_grid` and `robust_likelihood_grid` draw from what all scans so far say by their likelihood, as `localize`
+  does, and `*_markov_dsom` from what the network says of all of them; the other `adam_*`, `robust_*` and `mixture_*`
+  from what the last one says
 """
 
 
@@ -134,6 +135,7 @@ def pairs(entries: dict[Variant, dict[str, Any]]) -> Iterator[tuple[Variant, Var
     ]
     chosen += [(find(name), find("adam_dsom")) for name in ("adam_likelihood_grid", "adam_hybrid")]
     chosen += [(find("adam_markov_grid"), find("adam_likelihood_grid"))]
+    chosen += [(find("adam_markov_dsom"), find(name)) for name in ("adam_dsom", "adam_markov_grid")]
     chosen += [(find("robust_likelihood_grid"), find(name)) for name in ("adam_likelihood_grid", "robust_dsom")]
     yield from ((a, b) for a, b in chosen if a and b)
 
