@@ -22,6 +22,7 @@ from dsom_jax.nn.local_view import ViewConfig
 from dsom_jax.proposals.dual_features import DualFeaturesConfig
 from dsom_jax.proposals.hybrid import HybridConfig
 from dsom_jax.proposals.likelihood_grid import LikelihoodGridConfig
+from dsom_jax.proposals.markov_network import MarkovNetworkConfig
 from dsom_jax.raycast import RaycastConfig
 from dsom_jax.sensor import BeamModel, LikelihoodField, ScoreModel
 from dsom_jax.simulate.drive import DriveConfig
@@ -79,6 +80,7 @@ WRONG: dict[type, tuple[dict, dict]] = {
     LikelihoodGridConfig: ({}, {
         "resolution": (0.0, NAN), "headings": (0,), "angles_per_heading": (0,), "beams": (0,),
     }),
+    MarkovNetworkConfig: ({}, {"power": (0.0, NAN), "temper": (-0.1, NAN), "floor": (0.0, 1.0)}),
     HybridConfig: ({}, {"evidence": (-1.0, NAN), "network": (-0.1,), "floor": (0.0, 1.0)}),
     DualFeaturesConfig: ({}, {
         "samples": (0, 9), "layouts": (0,), "obstacles": (-1,), "bandwidth": (0.0, NAN), "headings": (0,),

@@ -32,7 +32,7 @@ from dsom_jax.proposals.dsom import dsom
 from dsom_jax.proposals.hybrid import Hybrid, HybridConfig, interpolate_headings
 from dsom_jax.proposals.likelihood_grid import LikelihoodGridConfig, likelihood_grid
 from dsom_jax.proposals.markov_grid import MarkovGrid, MarkovGridConfig
-from dsom_jax.proposals.markov_network import MarkovNetwork
+from dsom_jax.proposals.markov_network import MarkovNetwork, MarkovNetworkConfig
 from dsom_jax.proposals.uniform import free_space
 from dsom_jax.sensor import BeamModel
 from dsom_jax.types import Inputs
@@ -154,22 +154,26 @@ def test_powers_of_methods_are_those_of_their_filters():
         *LEARNED, *(name for name in METHODS if name.startswith("robust_"))
     }  # fmt: skip
     assert {name for name, powers in found.items() if powers == (1.0, 8.0)} == {
-        "adam_likelihood_grid", "adam_hybrid", "adam_markov_grid", "adam_markov_dsom"
+        "adam_likelihood_grid", "adam_hybrid", "adam_markov_grid", "adam_markov_dsom", "adam_markov_hybrid"
     }  # fmt: skip
     assert found["adam_dsom"] == found["mcl"] == found["mixture_mcl_star"] == (8.0, 16.0)
     assert powers_of("adam_dsom", 1.0) == (1.0, 1.0)
 
 
-def test_a_memory_of_the_network_multiplies_its_maps_along_the_drive(parts):
+@pytest.mark.parametrize("temper", [0.0, 0.1])
+def test_a_memory_of_the_network_multiplies_its_maps_along_the_drive(parts, temper):
     """A robot that stands still and sees two scans: PM of both, each to the power, times each other."""
     still = MarkovGridConfig(kidnap=1e-12, slip=0.0)
-    memory = MarkovNetwork(parts[0], still, network=parts[1], power=0.4, floor=0.02)
+    worth = MarkovNetworkConfig(power=0.4, temper=temper, floor=0.02)
+    memory = MarkovNetwork(parts[0], still, network=parts[1], worth=worth)
     scans = [Inputs(tiny_world.drive().ranges[t], jnp.full(3, jnp.nan), jnp.int32(n)) for n, t in enumerate((3, 9))]
     belief, expected = memory.begin(), 1.0
     for scan in scans:
         prepared, belief = memory.recall(belief, scan)
         log_pm = Hybrid(*parts, HybridConfig(floor=0.02)).log_network(scan)
-        expected = expected * np.exp(0.4 * np.asarray(log_pm, np.float64))
+        # The parts' own temper is 0.2.
+        log_likelihood = temper / 0.2 * np.asarray(parts[0].log_likelihood(scan.ranges), np.float64)
+        expected = expected * np.exp(0.4 * np.asarray(log_pm, np.float64) + log_likelihood)
     expected = np.where(np.asarray(memory.begin()) > 0, expected, 0.0)
     np.testing.assert_allclose(belief, expected / expected.sum(), rtol=1e-3, atol=1e-9)
     poses, log_density = memory.sample(jax.random.key(0), prepared, 50)
@@ -178,11 +182,14 @@ def test_a_memory_of_the_network_multiplies_its_maps_along_the_drive(parts):
 
 def test_filters_that_remember_what_the_network_said_are_offered(parts):
     made = {"likelihood_grid": parts[0], "dsom": parts[1]}
-    for name, kind in (("adam_markov_dsom", AdamRecalling), ("robust_markov_dsom", AdamMemory)):
-        assert network_of(name) == "dsom" and name not in STANDARD
-        built = build_filter(name, tiny_world.grid(), LIDAR, particles=20, t_cut=0.6, sources=made)
-        assert isinstance(built, kind) and isinstance(built.proposal, MarkovNetwork)
-        assert built.proposal.power == Settings().memory_network
+    for source, worth in (("dsom", Settings().markov_dsom), ("hybrid", Settings().markov_hybrid)):
+        for algorithm, kind in (("adam", AdamRecalling), ("robust", AdamMemory)):
+            name = f"{algorithm}_markov_{source}"
+            assert network_of(name) == "dsom" and name not in STANDARD
+            built = build_filter(name, tiny_world.grid(), LIDAR, particles=20, t_cut=0.6, sources=made)
+            assert isinstance(built, kind) and isinstance(built.proposal, MarkovNetwork)
+            assert built.proposal.worth == worth
+    assert built.share == Settings().network_share
 
 
 def test_power_one_is_as_printed():

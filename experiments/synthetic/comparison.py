@@ -25,7 +25,7 @@ COMPARED = ("mcl", "mixture_mcl", "mixture_mcl_star", "pfrnn", "pf_net", "adam_d
 ABLATED = ("mcl", "mixture_mcl_star", "mixture_mcl_dsom", "adam_dsom", "adam_likelihood_grid", "adam_hybrid",
            "adam_markov_grid", "robust_dsom", "robust_likelihood_grid", "robust_hybrid")  # fmt: skip
 """The paper's ablation, then what is ours."""
-OTHERS = ("robust_markov_grid", "adam_markov_dsom", "robust_markov_dsom")
+OTHERS = ("robust_markov_grid", "adam_markov_dsom", "robust_markov_dsom", "adam_markov_hybrid", "robust_markov_hybrid")
 
 
 @dataclass(frozen=True)

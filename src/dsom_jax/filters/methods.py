@@ -26,7 +26,7 @@ from dsom_jax.proposals.dual_features import DualFeaturesConfig, dual_features, 
 from dsom_jax.proposals.hybrid import Hybrid, HybridConfig
 from dsom_jax.proposals.likelihood_grid import LikelihoodGrid, LikelihoodGridConfig, likelihood_grid
 from dsom_jax.proposals.markov_grid import MarkovGrid, MarkovGridConfig
-from dsom_jax.proposals.markov_network import MarkovNetwork
+from dsom_jax.proposals.markov_network import MarkovNetwork, MarkovNetworkConfig
 from dsom_jax.proposals.uniform import free_space
 from dsom_jax.raycast import RaycastConfig, make_tables
 from dsom_jax.sensor import BeamModel, ScoreModel
@@ -44,11 +44,13 @@ COMBINATIONS: dict[str, tuple[Algorithm, str]] = {
     "adam_hybrid": ("adam", "hybrid"),
     "adam_markov_grid": ("adam", "markov_grid"),
     "adam_markov_dsom": ("adam", "markov_dsom"),
+    "adam_markov_hybrid": ("adam", "markov_hybrid"),
     "robust_dsom": ("adam_robust", "dsom"),
     "robust_likelihood_grid": ("adam_robust", "likelihood_grid"),
     "robust_hybrid": ("adam_robust", "hybrid"),
     "robust_markov_grid": ("adam_robust", "markov_grid"),
     "robust_markov_dsom": ("adam_robust", "markov_dsom"),
+    "robust_markov_hybrid": ("adam_robust", "markov_hybrid"),
 }
 LEARNED: dict[str, Callable[..., Filter]] = {"pf_net": pf_net, "pfrnn": pfrnn}
 """Filters that are networks themselves; each has the name of its kind of network."""
@@ -57,14 +59,9 @@ PARTS = {
     "hybrid": ("likelihood_grid", "dsom"),
     "markov_grid": ("likelihood_grid",),
     "markov_dsom": ("likelihood_grid", "dsom"),
+    "markov_hybrid": ("likelihood_grid", "dsom"),
 }
-SURE_TYPES: dict[type, str] = {
-    LikelihoodGrid: "likelihood_grid",
-    Hybrid: "hybrid",
-    MarkovGrid: "markov_grid",
-    MarkovNetwork: "markov_dsom",
-}
-SURE = frozenset(SURE_TYPES.values())
+SURE = ("likelihood_grid", *PARTS)
 """Proposals that hold the exact likelihood of a scan, or what all scans so far say."""
 METHODS: tuple[str, ...] = (*COMBINATIONS, *LEARNED)
 STANDARD: tuple[str, ...] = tuple(name for name, (_, proposal) in COMBINATIONS.items() if proposal not in PARTS)
@@ -82,15 +79,15 @@ WEIGHT_POWER = 8.0
 """Default of :attr:`Settings.weight_power`."""
 
 
-def powers(algorithm: str, source: str, weight_power: float) -> tuple[float, float]:
-    """Powers of Eq 15 by which a filter that weighs by it draws and averages; ``source`` is its proposal.
+def powers(algorithm: str, sure: bool, weight_power: float) -> tuple[float, float]:
+    """Powers of Eq 15 by which a filter that weighs by it draws and averages; is its proposal one of :data:`SURE`?
 
     Draws have to leave room for places that are only likely, an average has not: it goes by 16 where draws go by 8,
     and by 1, as printed, where they do (experiments/dsom/REPORT.md). Alg 1 with one of :data:`SURE` as its proposal
     draws as printed and averages by ``weight_power``: PM then is as good as sure, and what gathers sooner than PM
     arrives stays at a wrong place that looks alike.
     """
-    if algorithm == "adam" and source in SURE:
+    if algorithm == "adam" and sure:
         return 1.0, weight_power
     return weight_power, round(weight_power ** (4 / 3), 9)
 
@@ -99,7 +96,8 @@ def powers_of(method: str, weight_power: float = WEIGHT_POWER) -> tuple[float, f
     """:func:`powers` of a method of :data:`METHODS`; None for those that do not weigh by Eq 15."""
     if method in LEARNED or COMBINATIONS[method][0] == "adam_robust":
         return None
-    return powers(*COMBINATIONS[method], weight_power)
+    algorithm, proposal = COMBINATIONS[method]
+    return powers(algorithm, proposal in SURE, weight_power)
 
 
 @dataclass(frozen=True)
@@ -125,8 +123,9 @@ class Settings:
         memory_share: least and greatest weight of what that memory says, beside the particles' own past.
         memory_temper: factor on a scan's log-likelihood in that memory, in place of the grid's own: where the map is
             wrong, scans taken one after another err alike.
-        memory_network: exponent of DSOM's PM in a memory of such maps.
-        markov: how these memories move.
+        markov: how that memory moves, and those of the network.
+        markov_dsom, markov_hybrid: what a scan is worth in a memory of the network alone, and of it and the likelihood.
+        network_share: as ``memory_share``, of a memory of the network.
     """
 
     particles: int = 200
@@ -147,15 +146,18 @@ class Settings:
     memory: bool = False
     memory_share: tuple[float, float] = (0.01, 0.5)
     memory_temper: float = 0.05
-    memory_network: float = 0.3
     markov: MarkovGridConfig = MarkovGridConfig()
+    markov_dsom: MarkovNetworkConfig = MarkovNetworkConfig()
+    markov_hybrid: MarkovNetworkConfig = MarkovNetworkConfig(power=0.15, temper=0.01)
+    network_share: tuple[float, float] = (0.5, 0.5)
 
     def __post_init__(self) -> None:
         checks.count(self, "particles max_beams")
         checks.count(self, "seed", 0)
         checks.share(self, "t_cut")
         checks.span(self, "memory_share")
-        checks.positive(self, "weight_power sharpness robust_sharpness memory_temper memory_network")
+        checks.span(self, "network_share")
+        checks.positive(self, "weight_power sharpness robust_sharpness memory_temper")
 
 
 _SCANNED = 1.0
@@ -228,13 +230,14 @@ def make_proposal(
         return likelihood_grid(grid, lidar, replace(settings.grid, model=model))
     if name == "dsom":
         return dsom(checkpoint, grid, lidar, settings.sharpness, settings.raycast.surface)
-    if name in ("hybrid", "markov_dsom"):
+    if name in ("hybrid", "markov_dsom", "markov_hybrid"):
         have = made or {}
         parts = (have.get(p) or make_proposal(p, grid, lidar, settings, checkpoint) for p in PARTS[name])
         likelihood, network = parts  # type: Any, Any  # as their names say
         if name == "hybrid":
             return Hybrid(likelihood, network, settings.hybrid)
-        return MarkovNetwork(likelihood, settings.markov, network=network, power=settings.memory_network)
+        worth = settings.markov_dsom if name == "markov_dsom" else settings.markov_hybrid
+        return MarkovNetwork(likelihood, settings.markov, network=network, worth=worth)
     if name == "markov_grid":
         single = (made or {}).get("likelihood_grid") or make_proposal("likelihood_grid", grid, lidar, settings)
         return remembering(single, settings)  # type: ignore[arg-type]  # as its name says
@@ -264,12 +267,14 @@ def make_filter(
         if settings.memory and isinstance(proposal, LikelihoodGrid):
             proposal = remembering(proposal, settings)
         if isinstance(proposal, MarkovGrid):
-            return AdamMemory(tables, space, proposal, *parts, settings.memory_share)
+            share = settings.network_share if isinstance(proposal, MarkovNetwork) else settings.memory_share
+            return AdamMemory(tables, space, proposal, *parts, share)
         return AdamRobust(tables, space, proposal, *parts)
     score = replace(settings.score, range_max=lidar.range_max)
     tables = make_tables(grid, settings.raycast, lidar.range_max)
     world = World(tables, space, used, step, settings.motion, score)
-    drawn, averaged = powers(algorithm, SURE_TYPES.get(type(proposal), ""), settings.weight_power)
+    sure = isinstance(proposal, LikelihoodGrid | Hybrid | MarkovGrid)
+    drawn, averaged = powers(algorithm, sure, settings.weight_power)
     judge: Estimate = "weight" if averaged == 1 else "likelihood"
     config = FilterConfig(settings.particles, weight_power=drawn, estimate_power=averaged, estimate_by=judge)
     if algorithm == "mcl":

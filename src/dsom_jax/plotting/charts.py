@@ -22,11 +22,13 @@ STYLES = {
     "adam_hybrid": ("AdaM + hybrid", "#b5179e"),
     "adam_markov_grid": ("AdaM + Markov grid", "#7f3b08"),
     "adam_markov_dsom": ("AdaM + Markov DSOM", "#5e3c99"),
+    "adam_markov_hybrid": ("AdaM + Markov hybrid", "#2d004b"),
     "robust_dsom": ("robust + DSOM", "#1f77b4"),
     "robust_likelihood_grid": ("robust + likelihood grid", "#2ca02c"),
     "robust_hybrid": ("robust + hybrid", "#17becf"),
     "robust_markov_grid": ("robust + Markov grid", "#006d2c"),
     "robust_markov_dsom": ("robust + Markov DSOM", "#08306b"),
+    "robust_markov_hybrid": ("robust + Markov hybrid", "#4292c6"),
     "pf_net": ("PF-Net", "#bcbd22"),
     "pfrnn": ("PFRNN", "#9467bd"),
 }

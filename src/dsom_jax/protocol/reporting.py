@@ -39,8 +39,8 @@ Every clip starts without any prior on the pose; at its end the robot is carried
 - the paper's filters are judged by the weighted mean of the particles, robust ones by the heaviest cluster
 - network: as shipped, or trained on in this map for so long
 - `*_markov_grid` and `robust_likelihood_grid` draw from what all scans so far say by their likelihood, as `localize`
-  does, and `*_markov_dsom` from what the network says of all of them; the other `adam_*`, `robust_*` and `mixture_*`
-  from what the last one says
+  does, `*_markov_dsom` from what the network says of all of them, `*_markov_hybrid` from both; the other `adam_*`,
+  `robust_*` and `mixture_*` from what the last one says
 """
 
 
@@ -136,6 +136,7 @@ def pairs(entries: dict[Variant, dict[str, Any]]) -> Iterator[tuple[Variant, Var
     chosen += [(find(name), find("adam_dsom")) for name in ("adam_likelihood_grid", "adam_hybrid")]
     chosen += [(find("adam_markov_grid"), find("adam_likelihood_grid"))]
     chosen += [(find("adam_markov_dsom"), find(name)) for name in ("adam_dsom", "adam_markov_grid")]
+    chosen += [(find("robust_markov_hybrid"), find("robust_likelihood_grid"))]
     chosen += [(find("robust_likelihood_grid"), find(name)) for name in ("adam_likelihood_grid", "robust_dsom")]
     yield from ((a, b) for a, b in chosen if a and b)
 
