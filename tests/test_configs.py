@@ -64,7 +64,6 @@ WRONG: dict[type, tuple[dict, dict]] = {
     FilterConfig: ({}, {
         "particles": (0, -5, 1.5), "predecessor": ("nearest",), "resampling": ("none",), "weight_power": (0.0, NAN),
         "estimate_power": (0.0, NAN),
-        "estimate_by": ("truth",),
     }),
     MCL: (FILTER, {"injection": (-0.1, 1.1, NAN)}),
     MixtureMCL: (SHARED, {"p": (-0.1, 1.1, NAN)}),

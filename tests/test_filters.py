@@ -19,7 +19,7 @@ from dsom_jax.filters.adam import AdamMCL
 from dsom_jax.filters.common import ParticleState, heaviest_cluster
 from dsom_jax.filters.mcl import MCL
 from dsom_jax.filters.mixture import MixtureMCL
-from dsom_jax.filters.updates import Draw, FilterConfig, conclude
+from dsom_jax.filters.updates import FilterConfig
 from dsom_jax.motion import OdometryMotion
 from dsom_jax.proposals.likelihood_grid import likelihood_grid
 from filters_kit import (  # noqa: F401, fixtures
@@ -121,31 +121,6 @@ def test_estimates_have_a_power_of_their_own(world, spot, episode):
     share = np.asarray(state.weights, np.float64) ** 6
     expected = (np.asarray(state.poses)[:, :2] * share[:, None]).sum(0) / share.sum()
     np.testing.assert_allclose(info.mean[:2], expected, rtol=1e-4)
-
-
-def test_estimates_may_go_by_the_likelihood_of_redrawn_poses(world, spot, episode):
-    """It changes no particle; the mean is that of w of each pose, also of those that inherited another."""
-    config = replace(MCL_ONLY, estimate_power=3.0)
-    by_weight, by_likelihood = (
-        follow(AdamMCL(world, spot, replace(config, estimate_by=what)), episode, 3) for what in ("weight", "likelihood")
-    )
-    identical([state for state, _ in by_weight], [state for state, _ in by_likelihood])
-    state, info = by_likelihood[-1]
-    own = np.asarray(world.weigh(state.poses, episode.ranges[2]), np.float64)
-    assert 0 < np.isclose(own, state.weights, rtol=1e-5).mean() < 0.9
-    expected = (np.asarray(state.poses)[:, :2] * own[:, None] ** 3).sum(0) / (own**3).sum()
-    np.testing.assert_allclose(info.mean[:2], expected, rtol=1e-4)
-    assert np.abs(np.asarray(by_weight[-1][1].mean - info.mean)).max() > 1e-3
-
-
-def test_where_no_beam_of_any_pose_fits_estimates_go_by_what_was_inherited(episode, grid):
-    poses = jnp.stack([jnp.array([1.0, 1.0, 0.0]), jnp.array([3.0, 1.0, 0.0])])
-    draw = Draw(poses, jnp.array([0.2, 0.6]), jnp.zeros(2))
-    state = ParticleState(poses, draw.weights, jnp.array([0.5, 0.5]), jnp.int32(1))
-    config = FilterConfig(2, estimate_power=2.0, estimate_by="likelihood")
-    _, info = conclude(state, draw, jnp.float32(1.0), poses, config)
-    np.testing.assert_allclose(info.mean, [0.1 * 1 + 0.9 * 3, 1.0, 0.0], atol=1e-5)
-    assert not info.restarted
 
 
 def test_powers_of_tiny_weights_do_not_vanish(world, spot, episode, grid):

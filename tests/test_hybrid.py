@@ -192,11 +192,19 @@ def test_filters_that_remember_what_the_network_said_are_offered(parts):
     assert built.share == Settings().network_share
 
 
+@pytest.mark.parametrize(("factor", "expected"), [(1, (1, 360)), (4, (2, 180))])
+def test_maps_of_coarse_cells_have_more_viewpoints(factor, expected):
+    grid = tiny_world.grid()
+    grid = replace(grid, resolution=0.1 * factor)
+    tables = make_filter("mcl", free_space(grid), grid, LIDAR, Settings()).world.tables
+    assert (tables.walls.shape[0] // grid.shape[0], tables.walls.shape[2]) == expected
+
+
 def test_power_one_is_as_printed():
     for name in ("adam", "mixture_mcl", "mcl"):
         source, settings = free_space(tiny_world.grid()), Settings(weight_power=1.0)
         config = make_filter(name, source, tiny_world.grid(), LIDAR, settings).config
-        assert (config.weight_power, config.estimate_power, config.estimate_by) == (1.0, 1.0, "weight")
+        assert (config.weight_power, config.estimate_power) == (1.0, 1.0)
 
 
 @pytest.mark.parametrize("exact", [True, False])
@@ -209,4 +217,3 @@ def test_alg_1_draws_as_printed_from_what_is_as_good_as_sure_only(parts, exact):
             config = make_filter(name, source, tiny_world.grid(), LIDAR, settings).config
             drawn, averaged = (1.0, 8.0) if exact and name == "adam" else (8.0, 16.0)
             assert (config.weight_power, config.estimate_power) == (drawn, averaged)
-            assert config.estimate_by == "likelihood"

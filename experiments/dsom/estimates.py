@@ -25,7 +25,7 @@ from dsom_jax.filters.methods import Settings, make_filter, make_proposal
 from dsom_jax.montecarlo import run_keys
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.proposals.dsom import DSOMProposal
-from dsom_jax.raycast import RaycastConfig
+from dsom_jax.raycast import RaycastConfig, make_tables
 from dsom_jax.report import rounded, write_json
 from dsom_jax.run_folder import commit
 from dsom_jax.run_table import RunTable
@@ -35,7 +35,7 @@ from dsom_jax.types import Filter
 
 OUT = Path(__file__).parent / "results" / "estimates.json"
 OTHER_BUILDINGS = (201, 202, 203)
-CENTRES, FINE = RaycastConfig("table"), Settings().raycast
+CENTRES, FINE = RaycastConfig("table"), RaycastConfig("table", angles=180, viewpoints=2)
 
 
 class Change(NamedTuple):
@@ -45,9 +45,9 @@ class Change(NamedTuple):
     config: dict[str, Any]
 
 
-def estimate(power: float, by: str = "weight", **settings: Any) -> Change:
-    """Another power, or another weight, of the estimate."""
-    return Change(settings, {"estimate_power": power, "estimate_by": by})
+def estimate(power: float, **settings: Any) -> Change:
+    """Another power of the estimate."""
+    return Change(settings, {"estimate_power": power})
 
 
 VARIANTS: dict[str, Change] = {
@@ -63,10 +63,7 @@ VARIANTS: dict[str, Change] = {
     "16, predecessor by motion": Change({}, {"estimate_power": 16.0, "predecessor": "motion"}),
     "16, exact rays": estimate(16.0, raycast=RaycastConfig("exact")),
     "16, four viewpoints": estimate(16.0, raycast=FINE),
-    "16, w of the pose": estimate(16.0, "likelihood"),
-    "16, w of the pose, exact rays": estimate(16.0, "likelihood", raycast=RaycastConfig("exact")),
-    "16, w of the pose, four viewpoints": estimate(16.0, "likelihood", raycast=FINE),
-    "24, w of the pose, four viewpoints": estimate(24.0, "likelihood", raycast=FINE),
+    "24, four viewpoints": estimate(24.0, raycast=FINE),
 }
 
 
@@ -74,7 +71,7 @@ VARIANTS: dict[str, Change] = {
 class Args:
     """Run variants and print the table."""
 
-    variants: tuple[str, ...] = ("16", "16, w of the pose", "16, four viewpoints", "16, w of the pose, four viewpoints")
+    variants: tuple[str, ...] = ("16", "16, four viewpoints")
     """Names of variants."""
     particles: int = 200
     """Number of particles."""
@@ -109,8 +106,9 @@ def measure(change: Change, suite: Suite, network: Any, args: Args) -> RunTable:
 
     def build(_: str, where: str, grid: OccupancyGrid, __: Episode) -> Filter:
         filter: Any = make_filter("adam", proposal(where), grid, suite.lidar, settings)
-        config = replace(filter.config, estimate_by="weight")
-        return jax.block_until_ready(replace(filter, config=replace(config, **change.config)))
+        tables = make_tables(grid, settings.raycast, suite.lidar.range_max)
+        config = replace(filter.config, **change.config)
+        return jax.block_until_ready(replace(filter, world=replace(filter.world, tables=tables), config=config))
 
     keys = [run_keys(args.seed, number, args.runs) for number in range(len(suite.episodes))]
     return bench.run_method("adam_dsom", suite, keys, build).table

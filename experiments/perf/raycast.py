@@ -18,14 +18,18 @@ from timing import machine, measure, save
 
 from dsom_jax.compiling import run_options
 from dsom_jax.data.suite import load_suite
-from dsom_jax.filters.methods import Settings
+from dsom_jax.filters.methods import Settings, table_for
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.proposals.uniform import free_space
 from dsom_jax.raycast import RaycastConfig, cast_rays, make_tables
 
 RUNS, POSES, BEAMS = 100, 200, 72
-CONFIGS = {"exact": RaycastConfig("exact"), "table": RaycastConfig("table"), "table_as_used": Settings().raycast}
+CONFIGS = {
+    "exact": RaycastConfig("exact"),
+    "table": RaycastConfig("table"),
+    "table_as_used": table_for(1 / 3, Settings().raycast),
+}
 """The last one is that of the benchmark's filters."""
 
 

@@ -1,9 +1,8 @@
 """The exact filter on the grid, where particles fail: ``python experiments/robust/belief.py --network DIR``.
 
-Grid localization has no particles to lose: what its most probable cell does not find, the model of the sensor cannot
-tell. Each variant judges a scan by the tempered likelihood, by PM of DSOM to a power, or by both, on the clips of the
+Grid localization has no particles to lose: what its most probable cell does not find is not for want of them. Each variant judges a scan by the tempered likelihood, by PM of DSOM to a power, or by both, on the clips of the
 paper's protocol with their kidnappings, or on ``--windows`` pieces of the log without any. Writes
-``results/belief.json`` and prints it.
+``results/belief.MAP.PIECES.json`` and prints it.
 """
 
 from __future__ import annotations
@@ -19,11 +18,11 @@ import numpy as np
 import tyro
 
 from dsom_jax import checkpoint, metrics, pose_grid
-from dsom_jax.data import load_map
+from dsom_jax.data import RawLog, load_map
 from dsom_jax.data.cut import to_episode
 from dsom_jax.data.suite import Suite
 from dsom_jax.episode import Episode
-from dsom_jax.errors import run_cli
+from dsom_jax.errors import UserError, run_cli
 from dsom_jax.filters.methods import DRAWN, REAL, make_proposal
 from dsom_jax.geometry import compose
 from dsom_jax.occupancy import OccupancyGrid
@@ -31,7 +30,7 @@ from dsom_jax.proposals.hybrid import Hybrid
 from dsom_jax.proposals.markov_grid import MarkovGrid
 from dsom_jax.protocol.clips import choose, windows
 from dsom_jax.protocol.plan import Plan, map_file, read_logs, read_plan
-from dsom_jax.report import rounded, write_json
+from dsom_jax.report import output_folder, rounded, write_json
 from dsom_jax.run_folder import commit
 from dsom_jax.types import Array, Inputs
 
@@ -59,8 +58,10 @@ class Args:
     """The protocol."""
     data: Path = Path(os.environ.get("DSOM_DATA") or ROOT.parent / "shared" / "data")
     """Folder that holds a folder for each log."""
-    out: Path = HERE / "results" / "belief.json"
-    """Where results go."""
+    out: Path = HERE / "results"
+    """Folder for belief.MAP.PIECES.json."""
+    work: Path = ROOT / "runs" / "real"
+    """Folder for what is made on the way."""
 
 
 @jax.tree_util.register_dataclass
@@ -105,12 +106,12 @@ def follow(belief: Judged, inputs: Inputs) -> Array:
     return jax.lax.scan(update, belief.begin(), inputs)[1]
 
 
-def pieces(plan: Plan, args: Args, grid: OccupancyGrid, suite: Suite) -> list[Episode]:
-    """The drives of the protocol, or evenly spread pieces of the logs."""
-    if not args.windows:
+def pieces(plan: Plan, logs: list[RawLog], count: int, grid: OccupancyGrid, suite: Suite) -> list[Episode]:
+    """The drives of the protocol, or ``count`` evenly spread pieces of the logs."""
+    if not count:
         return [episode for _, _, episode in suite.episodes]
-    found = [(log, rows) for log in read_logs(plan, args.data) for rows in windows(log, grid, plan)]
-    chosen = np.linspace(0, len(found) - 1, args.windows).round().astype(int)
+    found = [(log, rows) for log in logs for rows in windows(log, grid, plan)]
+    chosen = np.linspace(0, len(found) - 1, count).round().astype(int)
     return [to_episode(log, rows) for log, rows in (found[n] for n in chosen)]
 
 
@@ -140,9 +141,15 @@ def show(row: dict[str, Any], phase: str) -> str:
 
 def main(args: Args) -> None:
     """All variants on all pieces."""
-    plan, fields = read_plan(args.config, {}).on(args.map)
-    grid = load_map(map_file(args.map, fields, args.data, args.out.parent))
-    suite = choose(plan, list(read_logs(plan, args.data)), args.map, grid)
+    series = read_plan(args.config, {})
+    if args.map not in series.maps:
+        raise UserError(f"--map {args.map}: {args.config} has {', '.join(series.maps)}")
+    if len(args.tempers) != len(args.powers):
+        raise UserError("--tempers, --powers: give as many of one as of the other")
+    plan, fields = series.on(args.map)
+    grid = load_map(map_file(args.map, fields, args.data, args.work))
+    logs = list(read_logs(plan, args.data))
+    suite = choose(plan, logs, args.map, grid)
     settings = DRAWN if plan.map_kind == "drawn" else REAL
     network = checkpoint.load(args.network, suite.lidar, kind="dsom")
     pool: Any = make_proposal("hybrid", grid, suite.lidar, settings, network)
@@ -151,7 +158,7 @@ def main(args: Args) -> None:
         {"temper": temper, "power": power, "kidnap": args.kidnap, "phases": {}}
         for temper, power in zip(args.tempers, args.powers, strict=True)
     ]
-    for episode in pieces(plan, args, grid, suite):
+    for episode in pieces(plan, logs, args.windows, grid, suite):
         scans = episode.inputs._replace(ranges=judged_scans(pool, episode.inputs))
         for row in rows:
             weights = jnp.array([row["temper"], row["power"]])
@@ -159,7 +166,10 @@ def main(args: Args) -> None:
             for phase, parts in judge(poses, episode).items():
                 row["phases"].setdefault(phase, []).extend(parts)
     facts = {"map": args.map, "windows": args.windows, "commit": commit()[:7]}
-    write_json(args.out, facts | {"network": checkpoint.digest(args.network), "rows": rounded(rows)})
+    name = f"belief.{args.map}.{f'{args.windows}-windows' if args.windows else 'clips'}.json"
+    write_json(
+        output_folder(args.out) / name, facts | {"network": checkpoint.digest(args.network), "rows": rounded(rows)}
+    )
     for row in rows:
         for phase in row["phases"]:
             print(show(row, phase))

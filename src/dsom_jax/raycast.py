@@ -82,8 +82,8 @@ def make_tables(grid: OccupancyGrid, config: RaycastConfig, range_max: float) ->
     """
     entries = grid.occupied.size * config.viewpoints**2 * config.angles
     if config.method == "table" and (entries >= 2**31 or max(grid.shape) >= 2**14):
-        cells, angles = "x".join(map(str, grid.shape)), config.angles
-        raise UserError(f"map of {cells} cells is too large for a table of {angles} angles; use method exact")
+        cells, count = "x".join(map(str, grid.shape)), config.viewpoints**2 * config.angles
+        raise UserError(f"map of {cells} cells is too large for a table of {count} rays from each; use method exact")
     squares = empty_squares(jnp.pad(grid.occupied, 1, constant_values=True), config.max_skip)
     tables = MapTables(grid, squares, None, range_max, config.surface * grid.resolution)
     if config.method == "exact":

@@ -49,7 +49,7 @@ class MCL:
         fresh, _ = self.world.space.sample(k_fresh, None, self.config.particles)
         poses = self._inject(moved, fresh)
         weights = self.world.weigh(poses, inputs.ranges)
-        return conclude(state, Draw(poses, weights, weights), jnp.float32(0.0), fresh, self.config)
+        return conclude(state, Draw(poses, weights), jnp.float32(0.0), fresh, self.config)
 
     def _inject(self, poses: Array, fresh: Array) -> Array:
         """Random particles in place of evenly spaced ones (neighbours in the set share an ancestor)."""

@@ -17,7 +17,7 @@ from dsom_jax.filters.mcl import MCL
 from dsom_jax.filters.mixture import MixtureMCL
 from dsom_jax.filters.pf_net import pf_net
 from dsom_jax.filters.pfrnn import pfrnn
-from dsom_jax.filters.updates import Estimate, FilterConfig, World
+from dsom_jax.filters.updates import FilterConfig, World
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.motion import OdometryMotion
 from dsom_jax.occupancy import OccupancyGrid
@@ -109,11 +109,11 @@ class Settings:
         t_cut: T_cut of Alg 1.
         max_beams: beams used for weighing.
         seed: of what is random while a filter is built (the samples of Mixture MCL).
-        motion, score, raycast: drive, Eq 15 and expected ranges of the paper's filters.
+        motion, score, raycast: drive, Eq 15 and expected ranges of the paper's filters; of a table on maps of coarse
+            cells see :func:`table_for`.
         weight_power: particles are drawn by Eq 15 to this power, as if so many such scans had been seen; 1 as printed,
             where a particle elsewhere weighs half as much as one at the truth (experiments/REPORT.md). Estimates
-            average by another, and Alg 1 with some proposals is an exception: :func:`powers`. Unless it is 1, an
-            estimate goes by what the scan says of a redrawn pose itself, not by what that pose has inherited.
+            average by another, and Alg 1 with some proposals is an exception: :func:`powers`.
         grid: the likelihood grid.
         sharpness: exponent of DSOM's PM in the paper's filters (``experiments/dsom``).
         hybrid: weights of likelihood grid and network.
@@ -134,7 +134,7 @@ class Settings:
     seed: int = 0
     motion: Motion = OdometryMotion()
     score: ScoreModel = ScoreModel()
-    raycast: RaycastConfig = RaycastConfig("table", angles=180, viewpoints=2)
+    raycast: RaycastConfig = RaycastConfig("table")
     grid: LikelihoodGridConfig = LikelihoodGridConfig()
     weight_power: float = WEIGHT_POWER
     sharpness: float = 3.0
@@ -246,6 +246,17 @@ def make_proposal(
     raise ValueError(f"make_proposal: no proposal is called {name!r}")
 
 
+_COARSE = 0.2
+"""Metres per cell above which the walls seen from its middle are not those seen from its corners."""
+
+
+def table_for(resolution: float, config: RaycastConfig) -> RaycastConfig:
+    """Coarse cells have four viewpoints, in half as many directions (``experiments/perf/raycast.py``)."""
+    if config.method != "table" or resolution <= _COARSE:
+        return config
+    return replace(config, viewpoints=2 * config.viewpoints, angles=config.angles // 2)
+
+
 def remembering(likelihood: LikelihoodGrid, settings: Settings) -> MarkovGrid:
     """The likelihood grid with a memory of earlier scans."""
     return MarkovGrid(likelihood.tempered(settings.memory_temper), settings.markov)
@@ -271,12 +282,11 @@ def make_filter(
             return AdamMemory(tables, space, proposal, *parts, share)
         return AdamRobust(tables, space, proposal, *parts)
     score = replace(settings.score, range_max=lidar.range_max)
-    tables = make_tables(grid, settings.raycast, lidar.range_max)
+    tables = make_tables(grid, table_for(grid.resolution, settings.raycast), lidar.range_max)
     world = World(tables, space, used, step, settings.motion, score)
     sure = isinstance(proposal, LikelihoodGrid | Hybrid | MarkovGrid)
     drawn, averaged = powers(algorithm, sure, settings.weight_power)
-    judge: Estimate = "weight" if averaged == 1 else "likelihood"
-    config = FilterConfig(settings.particles, weight_power=drawn, estimate_power=averaged, estimate_by=judge)
+    config = FilterConfig(settings.particles, weight_power=drawn, estimate_power=averaged)
     if algorithm == "mcl":
         return MCL(world, config)
     if algorithm == "mixture_mcl":

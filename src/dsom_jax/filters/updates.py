@@ -18,7 +18,6 @@ from dsom_jax.sensor import ScoreModel, beam_score, perfect_score
 from dsom_jax.types import Array, Inputs, Key, Motion, Proposal
 
 Predecessor = Literal["knn", "motion"]
-Estimate = Literal["weight", "likelihood"]
 _NEIGHBOURS = 3
 
 
@@ -33,8 +32,6 @@ class FilterConfig:
         resampling: scheme for the MCL part.
         weight_power: w_norm, by which particles are drawn, is proportional to w to this power; trust is w itself.
         estimate_power: the same for the estimates. Both are 1 in the paper.
-        estimate_by: what estimates average by: the particle's ``weight``, as in the paper, or the ``likelihood`` w of
-            the pose itself, where a redrawn particle's weight is its predecessor's.
     """
 
     particles: int = 200
@@ -42,14 +39,12 @@ class FilterConfig:
     resampling: Resampling = "systematic"
     weight_power: float = 1.0
     estimate_power: float = 1.0
-    estimate_by: Estimate = "weight"
 
     def __post_init__(self) -> None:
         checks.count(self, "particles")
         checks.positive(self, "weight_power estimate_power")
         checks.choice(self, "predecessor", get_args(Predecessor))
         checks.choice(self, "resampling", get_args(Resampling))
-        checks.choice(self, "estimate_by", get_args(Estimate))
 
 
 @jax.tree_util.register_dataclass
@@ -80,11 +75,10 @@ class World:
 
 
 class Draw(NamedTuple):
-    """Poses (N, 3), raw weights w (N,) and p(o | s) of the poses themselves (N,), in units of w*, too."""
+    """Poses (N, 3) and raw weights w (N,) of the new particles."""
 
     poses: Array
     weights: Array
-    likelihood: Array
 
 
 def start(key: Key, world: World, config: FilterConfig) -> ParticleState:
@@ -172,29 +166,21 @@ def _nearest(poses: Array, others: Array, count: int) -> tuple[Array, Array]:
 
 def powered(weights: Array, power: float) -> Array:
     """Weights (N,) to a power, normalised; taken in units of the largest, as powers of small numbers vanish."""
-    if power == 1:
-        return normalise(weights)
-    largest = weights.max()
-    return normalise((weights / jnp.where(largest > 0, largest, 1.0)) ** power)
+    return normalise(weights if power == 1 else (weights / weights.max()) ** power)
 
 
 def conclude(
     state: ParticleState, draw: Draw, redrawn: Array, spare: Array, config: FilterConfig
 ) -> tuple[ParticleState, Info]:
-    """P_t and what it says; if every weight has vanished, the poses ``spare`` (N, 3) take over (flagged in Info).
+    """P_t and what it says, ``redrawn`` () the share of new poses; if every weight has vanished, the poses ``spare``
+    (N, 3) take over (flagged in Info).
 
     They are trusted for one update, or none of them would ever be weighed.
     """
     dead = ~(draw.weights.sum() > 0)
     poses = jnp.where(dead, spare, draw.poses)
     weights = jnp.where(dead, 1.0, draw.weights)
-    if config.estimate_by == "likelihood":
-        # No beam of any particle may fit: what they inherited is then all that is known.
-        fits = ~dead & (draw.likelihood.sum() > 0)
-        judged = jnp.where(fits, draw.likelihood, weights)
-    else:
-        judged = weights
-    info = describe(poses, powered(judged, config.estimate_power), redrawn, dead)
+    info = describe(poses, powered(weights, config.estimate_power), redrawn, dead)
     return ParticleState(poses, weights, powered(weights, config.weight_power), state.updates + 1), info
 
 
@@ -211,11 +197,10 @@ def mixture_update(
     """MCL update of the particles ``high`` (N,), dual MCL update of the others (Alg 1, lines 10 to 21)."""
     k_high, k_low = jax.random.split(key)
     kept = resample_and_move(k_high, state, high, inputs, world, config)
-    redrawn, inherited = redraw(k_low, state, inputs, world, proposal, prepared, config)
-    poses = jnp.where(high[:, None], kept, redrawn)
-    likelihood = world.weigh(poses, inputs.ranges)
-    draw = Draw(poses, jnp.where(high, likelihood, inherited), likelihood)
-    return conclude(state, draw, 1.0 - high.mean(), redrawn, config)
+    fresh, inherited = redraw(k_low, state, inputs, world, proposal, prepared, config)
+    weights = jnp.where(high, world.weigh(kept, inputs.ranges), inherited)
+    draw = Draw(jnp.where(high[:, None], kept, fresh), weights)
+    return conclude(state, draw, 1.0 - high.mean(), fresh, config)
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Grid localization whose scans are judged by DSOM: its probability maps, multiplied along the drive.
 
-Where map and world differ everywhere by a little, as on a floor plan, learning judges a scan better than a likelihood
-that is sure of its mistake; one scan still says little, and a drive says more (``experiments/robust/NOTES.md``).
+For maps that differ from the world everywhere by a little, as floor plans do: there one scan says little, to a network
+as to a likelihood, and a drive says more (``experiments/robust/NOTES.md``).
 """
 
 from __future__ import annotations
