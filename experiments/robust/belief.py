@@ -1,7 +1,8 @@
 """The exact filter on the grid, where particles fail: ``python experiments/robust/belief.py --network DIR``.
 
-Grid localization has no particles to lose: what its most probable cell does not find is not for want of them. Each variant judges a scan by the tempered likelihood, by PM of DSOM to a power, or by both, on the clips of the
-paper's protocol with their kidnappings, or on ``--windows`` pieces of the log without any. Writes
+Grid localization has no particles to lose: what its most probable cell does not find is not for want of them. Each
+variant judges a scan by the tempered likelihood, by PM of DSOM to a power, or by both, on the clips of the paper's
+protocol with their kidnappings, or on ``--windows`` pieces of the log without any. Writes
 ``results/belief.MAP.PIECES.json`` and prints it.
 """
 
@@ -165,7 +166,8 @@ def main(args: Args) -> None:
             poses = follow(Judged(pool.likelihood, motion, weights=weights), scans)
             for phase, parts in judge(poses, episode).items():
                 row["phases"].setdefault(phase, []).extend(parts)
-    facts = {"map": args.map, "windows": args.windows, "commit": commit()[:7]}
+    facts: dict[str, Any] = {"map": args.map, "windows": args.windows, "commit": commit()[:7]}
+    facts["network"] = checkpoint.digest(args.network)
     name = f"belief.{args.map}.{f'{args.windows}-windows' if args.windows else 'clips'}.json"
     write_json(
         output_folder(args.out) / name, facts | {"network": checkpoint.digest(args.network), "rows": rounded(rows)}
