@@ -3,7 +3,7 @@
 Grid localization has no particles to lose: what its most probable cell does not find is not for want of them. Each
 variant judges a scan by the tempered likelihood, by PM of DSOM to a power, or by both, on the clips of the paper's
 protocol with their kidnappings, or on ``--windows`` pieces of the log without any. Writes
-``results/belief.MAP.PIECES.json`` and prints it.
+``beliefs/MAP.PIECES.json`` and prints it.
 """
 
 from __future__ import annotations
@@ -59,8 +59,8 @@ class Args:
     """The protocol."""
     data: Path = Path(os.environ.get("DSOM_DATA") or ROOT.parent / "shared" / "data")
     """Folder that holds a folder for each log."""
-    out: Path = HERE / "results"
-    """Folder for belief.MAP.PIECES.json."""
+    out: Path = HERE / "beliefs"
+    """Folder for MAP.PIECES.json."""
     work: Path = ROOT / "runs" / "real"
     """Folder for what is made on the way."""
 
@@ -168,7 +168,7 @@ def main(args: Args) -> None:
                 row["phases"].setdefault(phase, []).extend(parts)
     facts: dict[str, Any] = {"map": args.map, "windows": args.windows, "commit": commit()[:7]}
     facts["network"] = checkpoint.digest(args.network)
-    name = f"belief.{args.map}.{f'{args.windows}-windows' if args.windows else 'clips'}.json"
+    name = f"{args.map}.{f'{args.windows}-windows' if args.windows else 'clips'}.json"
     write_json(
         output_folder(args.out) / name, facts | {"network": checkpoint.digest(args.network), "rows": rounded(rows)}
     )
