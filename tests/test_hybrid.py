@@ -12,17 +12,12 @@ import pytest
 
 import tiny_world
 from dsom_jax import pose_grid as pg
-from dsom_jax.filters.adam import AdamRecalling
-from dsom_jax.filters.adam_memory import AdamMemory
 from dsom_jax.filters.methods import (
     LEARNED,
     METHODS,
-    STANDARD,
     Settings,
-    build_filter,
     make_filter,
     make_proposal,
-    network_of,
     powers_of,
 )
 from dsom_jax.geometry import compose
@@ -31,8 +26,8 @@ from dsom_jax.occupancy import is_free, resample
 from dsom_jax.proposals.dsom import dsom
 from dsom_jax.proposals.hybrid import Hybrid, HybridConfig, interpolate_headings
 from dsom_jax.proposals.likelihood_grid import LikelihoodGridConfig, likelihood_grid
-from dsom_jax.proposals.markov_grid import MarkovGrid, MarkovGridConfig
-from dsom_jax.proposals.markov_network import MarkovNetwork, MarkovNetworkConfig
+from dsom_jax.proposals.markov_grid import MarkovGrid
+from dsom_jax.proposals.markov_network import MarkovNetwork
 from dsom_jax.proposals.uniform import free_space
 from dsom_jax.sensor import BeamModel
 from dsom_jax.types import Inputs
@@ -158,38 +153,6 @@ def test_powers_of_methods_are_those_of_their_filters():
     }  # fmt: skip
     assert found["adam_dsom"] == found["mcl"] == found["mixture_mcl_star"] == (8.0, 16.0)
     assert powers_of("adam_dsom", 1.0) == (1.0, 1.0)
-
-
-@pytest.mark.parametrize("temper", [0.0, 0.1])
-def test_a_memory_of_the_network_multiplies_its_maps_along_the_drive(parts, temper):
-    """A robot that stands still and sees two scans: PM of both, each to the power, times each other."""
-    still = MarkovGridConfig(kidnap=1e-12, slip=0.0)
-    worth = MarkovNetworkConfig(power=0.4, temper=temper, floor=0.02)
-    memory = MarkovNetwork(parts[0], still, network=parts[1], worth=worth)
-    scans = [Inputs(tiny_world.drive().ranges[t], jnp.full(3, jnp.nan), jnp.int32(n)) for n, t in enumerate((3, 9))]
-    belief, expected = memory.begin(), 1.0
-    for scan in scans:
-        prepared, belief = memory.recall(belief, scan)
-        log_pm = Hybrid(*parts, HybridConfig(floor=0.02)).log_network(scan)
-        # The parts' own temper is 0.2.
-        log_likelihood = temper / 0.2 * np.asarray(parts[0].log_likelihood(scan.ranges), np.float64)
-        expected = expected * np.exp(0.4 * np.asarray(log_pm, np.float64) + log_likelihood)
-    expected = np.where(np.asarray(memory.begin()) > 0, expected, 0.0)
-    np.testing.assert_allclose(belief, expected / expected.sum(), rtol=1e-3, atol=1e-9)
-    poses, log_density = memory.sample(jax.random.key(0), prepared, 50)
-    np.testing.assert_allclose(memory.likelihood.log_density(prepared.posterior, poses), log_density, rtol=1e-4)
-
-
-def test_filters_that_remember_what_the_network_said_are_offered(parts):
-    made = {"likelihood_grid": parts[0], "dsom": parts[1]}
-    for source, worth in (("dsom", Settings().markov_dsom), ("hybrid", Settings().markov_hybrid)):
-        for algorithm, kind in (("adam", AdamRecalling), ("robust", AdamMemory)):
-            name = f"{algorithm}_markov_{source}"
-            assert network_of(name) == "dsom" and name not in STANDARD
-            built = build_filter(name, tiny_world.grid(), LIDAR, particles=20, t_cut=0.6, sources=made)
-            assert isinstance(built, kind) and isinstance(built.proposal, MarkovNetwork)
-            assert built.proposal.worth == worth
-    assert built.share == Settings().network_share
 
 
 @pytest.mark.parametrize(("factor", "expected"), [(1, (1, 360)), (4, (2, 180))])

@@ -132,7 +132,8 @@ def show(row: dict[str, Any]) -> str:
     """A row as a line: global / after the kidnapping."""
     sides = [row["result"][phase] for phase in ("global", "kidnap")]
     cells = [f"{row['variant']:36}", row["suite"], f"{row['particles']:5d} particles, {row['runs']:3d} runs"]
-    cells += [" / ".join(f"{side[key]:.3f}" for side in sides) for key in ("e_pos_m", "within_20", "retention")]
+    for key in ("e_pos_m", "within_20", "retention"):
+        cells.append(" / ".join("-" if side[key] is None else f"{side[key]:.3f}" for side in sides))
     return " | ".join(cells)
 
 

@@ -166,12 +166,10 @@ def main(args: Args) -> None:
             poses = follow(Judged(pool.likelihood, motion, weights=weights), scans)
             for phase, parts in judge(poses, episode).items():
                 row["phases"].setdefault(phase, []).extend(parts)
-    facts: dict[str, Any] = {"map": args.map, "windows": args.windows, "commit": commit()[:7]}
-    facts["network"] = checkpoint.digest(args.network)
+    facts = {"map": args.map, "windows": args.windows, "commit": commit()[:7]}
+    facts |= {"network": checkpoint.digest(args.network), "rows": rounded(rows)}
     name = f"{args.map}.{f'{args.windows}-windows' if args.windows else 'clips'}.json"
-    write_json(
-        output_folder(args.out) / name, facts | {"network": checkpoint.digest(args.network), "rows": rounded(rows)}
-    )
+    write_json(output_folder(args.out) / name, facts)
     for row in rows:
         for phase in row["phases"]:
             print(show(row, phase))

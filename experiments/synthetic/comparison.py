@@ -26,13 +26,13 @@ ABLATED = ("mcl", "mixture_mcl_star", "mixture_mcl_dsom", "adam_dsom", "adam_lik
            "adam_markov_grid", "robust_dsom", "robust_likelihood_grid", "robust_hybrid")  # fmt: skip
 """The paper's ablation, then what is ours."""
 OTHERS = ("robust_markov_grid", "adam_markov_dsom", "robust_markov_dsom", "adam_markov_hybrid", "robust_markov_hybrid")
+"""Not compared here: AdaM robust with a memory is what localize runs, and memories of DSOM are for floor plans."""
 
 
 @dataclass(frozen=True)
 class Config:
     """Attributes: methods; runs of each on each sequence; particles; T_cut of Alg 1; powers of Eq 15."""
 
-    # AdaM robust with a memory is what localize runs, and DSOM with one is for floor plans.
     methods: tuple[str, ...] = tuple(name for name in METHODS if name not in OTHERS)
     runs: int = 100
     particles: int = 200
