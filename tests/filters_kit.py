@@ -18,6 +18,8 @@ from dsom_jax.filters.mcl import MCL
 from dsom_jax.filters.mixture import MixtureMCL
 from dsom_jax.filters.updates import FilterConfig, World
 from dsom_jax.motion import OdometryMotion
+from dsom_jax.nn import DSOMConfig, create, evaluation_view
+from dsom_jax.proposals.dsom import DSOMProposal, dsom
 from dsom_jax.proposals.likelihood_grid import LikelihoodGridConfig
 from dsom_jax.proposals.uniform import free_space
 from dsom_jax.raycast import RaycastConfig, make_tables
@@ -29,6 +31,14 @@ SCORE = ScoreModel(sigma=0.4, range_max=LIDAR.range_max)
 BEAM = BeamModel(sigma_hit=0.2, temper=0.5, range_max=LIDAR.range_max)
 GRID = LikelihoodGridConfig(resolution=0.25, headings=16, angles_per_heading=2, beams=32, model=BEAM)
 MCL_ONLY = FilterConfig(64)
+NETWORK = DSOMConfig(width=2, headings=8, channels=2, resolution=0.25, range_max=8.0, reach_min=1.0, fov_min=0.1)
+
+
+def decided_network() -> DSOMProposal:
+    """An untrained DSOM on the small world, sharpened: as it is created it says nearly the same of all places."""
+    model = create(NETWORK, seed=3)
+    model.decoder.head.kernel[...] = model.decoder.head.kernel[...] * 300
+    return dsom(evaluation_view(model), tiny_world.grid(), LIDAR)
 
 
 @jax.tree_util.register_dataclass

@@ -21,7 +21,7 @@ from dsom_jax.filters.methods import (
     powers_of,
 )
 from dsom_jax.geometry import compose
-from dsom_jax.nn import DSOMConfig, create, evaluation_view
+from dsom_jax.nn import create, evaluation_view
 from dsom_jax.occupancy import is_free, resample
 from dsom_jax.proposals.dsom import dsom
 from dsom_jax.proposals.hybrid import Hybrid, HybridConfig, interpolate_headings
@@ -31,21 +31,16 @@ from dsom_jax.proposals.markov_network import MarkovNetwork
 from dsom_jax.proposals.uniform import free_space
 from dsom_jax.sensor import BeamModel
 from dsom_jax.types import Inputs
+from filters_kit import LIDAR, NETWORK, decided_network
 
-LIDAR = tiny_world.LIDAR
 MODEL = BeamModel(sigma_hit=0.2, temper=0.2, range_max=LIDAR.range_max)
 GRID = LikelihoodGridConfig(resolution=0.25, headings=16, angles_per_heading=2, beams=32, model=MODEL)
-NETWORK = DSOMConfig(width=2, headings=8, channels=2, resolution=0.25, range_max=8.0, reach_min=1.0, fov_min=0.1)
 prepare = jax.jit(lambda proposal, inputs: proposal.prepare(inputs))
 
 
 @pytest.fixture(scope="module")
 def parts():
-    # Sharpened: a network that was never trained says nearly the same of all places.
-    model = create(NETWORK, seed=3)
-    model.decoder.head.kernel[...] = model.decoder.head.kernel[...] * 300
-    grid = tiny_world.grid()
-    return likelihood_grid(grid, LIDAR, GRID), dsom(evaluation_view(model), grid, LIDAR)
+    return likelihood_grid(tiny_world.grid(), LIDAR, GRID), decided_network()
 
 
 @pytest.fixture(scope="module")

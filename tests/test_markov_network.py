@@ -17,26 +17,19 @@ from dsom_jax.filters.adam_memory import AdamMemory
 from dsom_jax.filters.methods import STANDARD, Settings, build_filter, make_filter, network_of
 from dsom_jax.geometry import wrap_angle
 from dsom_jax.montecarlo import run, run_keys
-from dsom_jax.nn import DSOMConfig, create, evaluation_view
-from dsom_jax.proposals.dsom import dsom
 from dsom_jax.proposals.hybrid import Hybrid, HybridConfig
 from dsom_jax.proposals.likelihood_grid import likelihood_grid
 from dsom_jax.proposals.markov_grid import MarkovGrid, MarkovGridConfig
 from dsom_jax.proposals.markov_network import MarkovNetwork, MarkovNetworkConfig
 from dsom_jax.types import Array, Inputs
-from filters_kit import GRID, LIDAR
+from filters_kit import GRID, LIDAR, decided_network
 
-NETWORK = DSOMConfig(width=2, headings=8, channels=2, resolution=0.25, range_max=8.0, reach_min=1.0, fov_min=0.1)
 MOUNTED = replace(LIDAR, mount=(-0.6, 0.4, 0.5))
 
 
 @pytest.fixture(scope="module")
 def parts():
-    # Sharpened: a network that was never trained says nearly the same of all places.
-    model = create(NETWORK, seed=3)
-    model.decoder.head.kernel[...] = model.decoder.head.kernel[...] * 300
-    grid = tiny_world.grid()
-    return likelihood_grid(grid, LIDAR, GRID), dsom(evaluation_view(model), grid, LIDAR)
+    return likelihood_grid(tiny_world.grid(), LIDAR, GRID), decided_network()
 
 
 @jax.tree_util.register_dataclass

@@ -13,16 +13,15 @@ import pytest
 
 import tiny_world
 from dsom_jax.geometry import wrap_angle
-from dsom_jax.nn import DSOMConfig, create, evaluation_view
+from dsom_jax.nn import create, evaluation_view
 from dsom_jax.proposals.dsom import dsom
 from dsom_jax.proposals.hybrid import Hybrid
 from dsom_jax.proposals.likelihood_grid import likelihood_grid
 from dsom_jax.proposals.markov_grid import MarkovGridConfig
 from dsom_jax.run_table import RunTable, join
-from filters_kit import GRID, LIDAR
+from filters_kit import GRID, LIDAR, NETWORK
 
 FOLDER = Path(__file__).resolve().parents[1] / "experiments"
-NETWORK = DSOMConfig(width=2, headings=8, channels=2, resolution=0.25, range_max=8.0, reach_min=1.0, fov_min=0.1)
 
 
 @pytest.fixture
