@@ -18,7 +18,8 @@ LAYERS = (
     ("proposals", "metrics", "statistics", "run_table"),
     ("filters", "training", "montecarlo"),
     ("atomic", "data", "checkpoint", "run_folder", "trained", "plotting", "report", "judging"),
-    ("cli", "trainer", "train", "train_filter", "bench", "localize", "evaluate", "protocol"),
+    ("live",),
+    ("cli", "trainer", "train", "train_filter", "bench", "localize", "evaluate", "protocol", "ros2"),
 )
 DEVICE = 5
 """Layers below this are device code."""
