@@ -17,7 +17,7 @@ LAYERS = (
     ("motion", "sensor", "nn", "simulate"),
     ("proposals", "metrics", "statistics", "run_table"),
     ("filters", "training", "montecarlo"),
-    ("atomic", "data", "checkpoint", "run_folder", "trained", "plotting", "report", "judging"),
+    ("atomic", "data", "checkpoint", "run_folder", "trained", "plotting", "report", "judging", "view"),
     ("live",),
     ("cli", "trainer", "train", "train_filter", "bench", "localize", "evaluate", "protocol", "ros2"),
 )

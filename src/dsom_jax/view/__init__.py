@@ -1,0 +1,10 @@
+"""What a person looks at: a page of its own for every answer, and a picture beside it."""
+
+from dsom_jax.view.page import render, write_page
+from dsom_jax.view.picture import trajectory_figure
+from dsom_jax.view.story import DriveStory, Field, Finding, Hypotheses, Lookalike, Plan, Story
+
+__all__ = [
+    "DriveStory", "Field", "Finding", "Hypotheses", "Lookalike", "Plan", "Story",
+    "render", "trajectory_figure", "write_page",
+]  # fmt: skip
