@@ -17,9 +17,9 @@ import pytest
 from dsom_jax import bench, checkpoint, report
 from dsom_jax.episode import Episode
 from dsom_jax.errors import UserError, run_cli
+from dsom_jax.judging.run_table import paired
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.occupancy import from_cells
-from dsom_jax.run_table import paired
 
 STEPS, MOVED = 24, 12
 M_KEYS = {

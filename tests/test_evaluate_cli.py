@@ -14,10 +14,10 @@ import pytest
 from dsom_jax import checkpoint, evaluate
 from dsom_jax import pose_grid as pg
 from dsom_jax.errors import run_cli
+from dsom_jax.judging import quality
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.nn import DSOMConfig, create
 from dsom_jax.occupancy import from_cells
-from dsom_jax.training import quality
 
 SIDE, HEADINGS, RESOLUTION = 40, 8, 0.25
 KEYS = {

@@ -13,12 +13,12 @@ import pytest
 
 import tiny_world
 from dsom_jax.geometry import wrap_angle
+from dsom_jax.judging.run_table import RunTable, join
 from dsom_jax.nn import create, evaluation_view
 from dsom_jax.proposals.dsom import dsom
 from dsom_jax.proposals.hybrid import Hybrid
 from dsom_jax.proposals.likelihood_grid import likelihood_grid
 from dsom_jax.proposals.markov_grid import MarkovGridConfig
-from dsom_jax.run_table import RunTable, join
 from filters_kit import GRID, LIDAR, NETWORK
 
 FOLDER = Path(__file__).resolve().parents[1] / "experiments"

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.stats import binomtest
 from scipy.stats import bootstrap as scipy_bootstrap
 
-from dsom_jax import metrics
+from dsom_jax.judging import metrics
 
 DEG = math.pi / 180
 # The dict of the benchmark as DESIGN section 5 fixes it.

@@ -23,10 +23,10 @@ from dsom_jax import localize
 from dsom_jax.data import load_map, save_ros_map, save_tum, se2
 from dsom_jax.errors import UserError, run_cli
 from dsom_jax.filters.methods import REAL
+from dsom_jax.judging.run_table import from_columns
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.protocol import command
 from dsom_jax.raycast import RaycastConfig, cast_rays, make_tables
-from dsom_jax.run_table import from_columns
 from fixtures.make_bag import write_bag
 from tiny_log import UPDATES, path
 

@@ -21,8 +21,8 @@ from dsom_jax.data.suite import Suite
 from dsom_jax.episode import Episode
 from dsom_jax.errors import UserError
 from dsom_jax.filters.methods import DRAWN, LEARNED
+from dsom_jax.judging.metrics import measure_errors, pool, summarize
 from dsom_jax.lidar import LidarConfig
-from dsom_jax.metrics import measure_errors, pool, summarize
 from dsom_jax.occupancy import from_cells
 from dsom_jax.protocol import adapting, clips, command, reporting, running
 from dsom_jax.protocol.plan import Plan, Variant, read_plan, variants

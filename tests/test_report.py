@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from dsom_jax import metrics, plotting, report
+from dsom_jax import plotting, report
 from dsom_jax.errors import UserError
+from dsom_jax.judging import metrics
 from dsom_jax.occupancy import from_cells
 
 METHODS = ("mcl", "adam_dsom", "robust_likelihood_grid", "somebody_else")

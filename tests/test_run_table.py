@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dsom_jax import statistics as s
 from dsom_jax.errors import UserError
-from dsom_jax.metrics import Runs
+from dsom_jax.judging import statistics as s
+from dsom_jax.judging.metrics import Runs
+from dsom_jax.judging.run_table import join, paired, run_rows
 from dsom_jax.report import read_runs, write_runs
-from dsom_jax.run_table import join, paired, run_rows
 
 
 def runs_of(steps, e_pos) -> Runs:

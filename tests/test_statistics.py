@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from dsom_jax import statistics as s
-from dsom_jax.metrics import bootstrap
+from dsom_jax.judging import statistics as s
+from dsom_jax.judging.metrics import bootstrap
 
 flags = st.lists(st.tuples(st.booleans(), st.booleans()), max_size=60)
 

@@ -17,12 +17,12 @@ from dsom_jax.episode import Episode
 from dsom_jax.errors import UserError
 from dsom_jax.filters.methods import build_filter
 from dsom_jax.geometry import relative
+from dsom_jax.judging.metrics import Runs, measure_errors, pool, summarize
+from dsom_jax.judging.run_table import RunTable, columns_of, from_columns, join, run_rows
 from dsom_jax.lidar import LidarConfig
-from dsom_jax.metrics import Runs, measure_errors, pool, summarize
 from dsom_jax.montecarlo import run, run_keys
 from dsom_jax.occupancy import from_cells
 from dsom_jax.raycast import RaycastConfig, cast_rays, make_tables
-from dsom_jax.run_table import RunTable, columns_of, from_columns, join, run_rows
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "experiments" / "synthetic"))

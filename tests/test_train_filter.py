@@ -13,11 +13,11 @@ import dsom_jax
 import tiny_world
 from dsom_jax import checkpoint
 from dsom_jax.errors import UserError
+from dsom_jax.judging.tracking import tracked
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.nn import create_pf_net
 from dsom_jax.occupancy import OccupancyGrid, is_free
 from dsom_jax.training import filter_loop
-from dsom_jax.training.filter_evaluation import summarise
 from dsom_jax.training.filter_loop import (
     averaged_filter_model,
     init_filter_state,
@@ -175,7 +175,7 @@ def test_scans_are_thinned(pool):
 def test_summary_of_tracking():
     error = np.zeros((4, 3, 2))
     error[:, -1, 0] = [0.1, 0.2, 0.3, 0.9]
-    assert summarise(jnp.asarray(error)) | {"e_pos_m": 0} == {
+    assert tracked(jnp.asarray(error)) | {"e_pos_m": 0} == {
         "sequences": 4, "updates": 3, "tracked": 0.75, "e_pos_m": 0, "e_theta_rad": 0.0,
     }  # fmt: skip
 

@@ -20,8 +20,8 @@ import dsom_jax
 import tiny_world
 from dsom_jax import checkpoint, train_filter
 from dsom_jax.errors import UserError, run_cli
+from dsom_jax.judging import tracking
 from dsom_jax.nn import create_pfrnn
-from dsom_jax.training import filter_evaluation
 from dsom_jax.training.sequences import Window
 from learned_kit import training
 
@@ -69,7 +69,7 @@ def test_a_run_that_lost_its_end_resumes_bit_for_bit(files, monkeypatch):
         return Window(pool.where[:count], blank, jnp.zeros_like(poses), poses, jnp.zeros((count, strays, 3)))
 
     monkeypatch.setattr(train_filter, "parts", compiled_once)
-    monkeypatch.setattr(filter_evaluation, "make_windows", blank_windows)
+    monkeypatch.setattr(tracking, "make_windows", blank_windows)
     command(files, monkeypatch, "run")
     whole, log = weights(files / "run"), (files / "run" / "metrics.jsonl").read_text()
     record = json.loads((files / "run" / "provenance.json").read_text())

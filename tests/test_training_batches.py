@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from dsom_jax.judging.quality import mass_totals, of_logits
 from dsom_jax.nn import DSOMConfig
 from dsom_jax.nn.panorama import finer_ranges
 from dsom_jax.occupancy import from_cells
@@ -26,7 +27,6 @@ from dsom_jax.training.buildings import (
     random_poses,
     turned,
 )
-from dsom_jax.training.evaluation import score_map, summarise
 
 ROOM = jnp.zeros((40, 48), bool).at[::39].set(True).at[:, ::47].set(True).at[10:14, 20:24].set(True)
 
@@ -152,8 +152,8 @@ def test_eight_symmetries():
 def test_score_counts_probability_near_the_truth(offset, mass, top):
     # All probability in cell (4, 4), centre (2.25, 2.25) m, heading theta_4 = 0.
     log_pm = jnp.full((16, 16, 8), -jnp.inf).at[4, 4, 4].set(0.0)
-    score = score_map(log_pm, jnp.asarray([2.25 + offset, 2.25, 0.1]), 0.5)
-    assert float(score.mass) == mass and bool(score.top1) == top
-    turned_away = score_map(log_pm, jnp.asarray([2.25, 2.25, 0.4]), 0.5)
-    assert float(turned_away.mass) == 0.0 and not bool(turned_away.top1)
-    assert summarise(score)["mass_gt_1pct"] == float(mass > 0)
+    mass_here, right = of_logits(log_pm, 0.5, jnp.asarray([2.25 + offset, 2.25, 0.1]))
+    assert float(mass_here) == mass and bool(right) == top
+    turned_away = of_logits(log_pm, 0.5, jnp.asarray([2.25, 2.25, 0.4]))
+    assert float(turned_away[0]) == 0.0 and not bool(turned_away[1])
+    assert mass_totals(mass_here, right)["mass_gt_1pct"] == float(mass > 0)

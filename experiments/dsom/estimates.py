@@ -22,13 +22,13 @@ from dsom_jax.data.suite import Suite, load_suite
 from dsom_jax.episode import Episode
 from dsom_jax.errors import UserError, run_cli
 from dsom_jax.filters.methods import Settings, make_filter, make_proposal
+from dsom_jax.judging.run_table import RunTable
 from dsom_jax.montecarlo import run_keys
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.proposals.dsom import DSOMProposal
 from dsom_jax.raycast import RaycastConfig, make_tables
 from dsom_jax.report import rounded, write_json
 from dsom_jax.run_folder import commit
-from dsom_jax.run_table import RunTable
 from dsom_jax.simulate.drive import DriveConfig, make_synthetic
 from dsom_jax.simulate.worlds import WorldConfig, make_world
 from dsom_jax.types import Filter

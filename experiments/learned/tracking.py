@@ -25,7 +25,7 @@ from dsom_jax.episode import Episode
 from dsom_jax.filters.learned import Prior, scatter
 from dsom_jax.filters.methods import LEARNED
 from dsom_jax.geometry import compose
-from dsom_jax.metrics import pose_error, wilson
+from dsom_jax.judging.metrics import pose_error, wilson
 from dsom_jax.montecarlo import run, run_keys
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.run_folder import commit

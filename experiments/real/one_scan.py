@@ -22,9 +22,9 @@ from dsom_jax import checkpoint, localize, report
 from dsom_jax.data import RawLog, load_log, load_ros_map
 from dsom_jax.errors import UserError, run_cli
 from dsom_jax.filters.methods import DRAWN, REAL, make_proposal
+from dsom_jax.judging import quality
 from dsom_jax.occupancy import OccupancyGrid, resample
 from dsom_jax.proposals.dsom import dsom
-from dsom_jax.training import quality
 from dsom_jax.types import Array, Proposal
 
 NAMES = ("intel", "freiburg-079", "walls-only")
@@ -71,8 +71,8 @@ def judge(name: str, args: Args, folder: Path) -> dict[str, dict[str, float]]:
     ranges, poses = scans(options, log)
     found = {}
     for label, proposal in proposals(name, grid, log, folder):
-        parts = jax.tree.map(np.asarray, quality.judge(proposal, grid, ranges, poses))
-        found[label] = quality.summarise(parts) | {"scans": len(poses)}
+        parts = jax.tree.map(np.asarray, quality.of_scans(proposal, grid, ranges, poses))
+        found[label] = quality.totals(parts) | {"scans": len(poses)}
         print(f"{name}, {label}: " + ", ".join(f"{key} {100 * found[label][key]:.1f} %" for key in SHOWN), flush=True)
     return found
 

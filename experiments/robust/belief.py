@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from dsom_jax import checkpoint, metrics, pose_grid
+from dsom_jax import checkpoint, pose_grid
 from dsom_jax.data import RawLog, load_map
 from dsom_jax.data.cut import to_episode
 from dsom_jax.data.suite import Suite
@@ -26,6 +26,7 @@ from dsom_jax.episode import Episode
 from dsom_jax.errors import UserError, run_cli
 from dsom_jax.filters.methods import DRAWN, REAL, make_proposal
 from dsom_jax.geometry import compose
+from dsom_jax.judging import metrics
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.proposals.hybrid import Hybrid
 from dsom_jax.proposals.markov_grid import MarkovGrid

@@ -15,8 +15,8 @@ from tables import bounds, markdown, number, percent
 
 from dsom_jax import bench, plotting
 from dsom_jax.filters.methods import METHODS, WEIGHT_POWER
-from dsom_jax.metrics import STEP_BINS
-from dsom_jax.run_table import RunTable, columns_of, from_columns, join
+from dsom_jax.judging.metrics import STEP_BINS
+from dsom_jax.judging.run_table import RunTable, columns_of, from_columns, join
 
 NAME = "comparison"
 PHASES = ("global", "kidnap")

@@ -20,11 +20,11 @@ from dsom_jax import plotting
 from dsom_jax import pose_grid as pg
 from dsom_jax.filters.methods import Settings, make_proposal
 from dsom_jax.geometry import transform_points
+from dsom_jax.judging import quality
+from dsom_jax.judging.statistics import clustered_bootstrap
 from dsom_jax.lidar import LidarConfig, scan_points
 from dsom_jax.occupancy import OccupancyGrid, from_cells
 from dsom_jax.plotting.common import legend
-from dsom_jax.statistics import clustered_bootstrap
-from dsom_jax.training import quality
 from dsom_jax.types import Array, Inputs, Key, Proposal
 
 NAME = "multimodal"
@@ -70,7 +70,7 @@ def judge_scenes(config: Config, lab: Lab) -> dict[str, Any]:
         made[where] = made.get(where) or proposals(lab, grid)
         ranges, poses = episode.ranges[:: config.every], episode.poses[:: config.every]
         for name in PROPOSALS:
-            found = quality.judge(made[where][name], grid, ranges, poses)
+            found = quality.of_scans(made[where][name], grid, ranges, poses)
             counts[name] += np.asarray(found.peaks).tolist()
             mass[name] += np.asarray(found.mass).tolist()
         scans += [(where, grid, *scan) for scan in zip(ranges, poses, strict=True)]

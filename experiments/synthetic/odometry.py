@@ -14,9 +14,9 @@ from matplotlib.ticker import MultipleLocator
 from side_by_side import noisier, run_all, with_error
 from tables import markdown, percent
 
-from dsom_jax import metrics
 from dsom_jax.bench import judge, judged_by
 from dsom_jax.episode import Episode
+from dsom_jax.judging import metrics
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.plotting.charts import STYLES
 from dsom_jax.plotting.common import legend

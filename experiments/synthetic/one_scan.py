@@ -15,12 +15,11 @@ from matplotlib.figure import Figure
 from scenes import Change, Condition, Scans, beams_of, map_and_building, take
 from tables import markdown, percent
 
-from dsom_jax import metrics
 from dsom_jax.filters.methods import DRAWN, Settings, make_proposal
+from dsom_jax.judging import metrics, quality
+from dsom_jax.judging.statistics import clustered_bootstrap
 from dsom_jax.nn import DSOM
 from dsom_jax.plotting.common import legend
-from dsom_jax.statistics import clustered_bootstrap
-from dsom_jax.training import quality
 from dsom_jax.types import Key
 
 NAME = "one_scan"
@@ -123,7 +122,7 @@ class Bed:
         scans = take(k_scans, shown, world, condition, self.config.scans)
         made = self.proposals((*place, condition.lidar, condition.drawn), condition, network)
         return scans, {
-            name: jax.tree.map(np.asarray, quality.judge(made[name], shown, scans.ranges, scans.poses))
+            name: jax.tree.map(np.asarray, quality.of_scans(made[name], shown, scans.ranges, scans.poses))
             for name in PROPOSALS
         }
 
@@ -149,7 +148,7 @@ def told(parts: list[quality.Quality]) -> dict[str, Any]:
     above = (mass > 0.01).astype(float)
     joined = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
     return {
-        **quality.summarise(joined),
+        **quality.totals(joined),
         "mass_mean_ci95": clustered_bootstrap(mass, world),
         "mass_gt_1pct_ci95": clustered_bootstrap(above, world),
         "top1_ci95": clustered_bootstrap(top, world),

@@ -12,7 +12,7 @@ from lab import POWERS, Everything, Lab, Piece
 from tables import bounds, markdown, number, percent
 
 from dsom_jax import bench
-from dsom_jax.run_table import columns_of
+from dsom_jax.judging.run_table import columns_of
 
 NAME = "particles"
 METHOD = "adam_dsom"

@@ -16,15 +16,14 @@ from matplotlib.figure import Figure
 from side_by_side import other_t_cut, run_all
 from tables import bounds, markdown, number, percent
 
-from dsom_jax import metrics
 from dsom_jax.bench import judge, judged_by
 from dsom_jax.episode import Episode
 from dsom_jax.filters.methods import COMBINATIONS
+from dsom_jax.judging import metrics, quality
+from dsom_jax.judging.run_table import RunTable, columns_of, join, run_rows
 from dsom_jax.montecarlo import run
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.plotting.common import legend, log_ticks
-from dsom_jax.run_table import RunTable, columns_of, join, run_rows
-from dsom_jax.training import quality
 
 NAME = "retention"
 DSOM = "adam_dsom"
@@ -75,7 +74,7 @@ def follow(
 
 def scene_of(lab: Lab, filter: Any, where: str, grid: OccupancyGrid, episode: Episode) -> Scene:
     """PM and trust at the truth, for every scan of a sequence."""
-    found = quality.judge(filter.proposal, grid, episode.ranges, episode.poses)
+    found = quality.of_scans(filter.proposal, grid, episode.ranges, episode.poses)
     scored = lab.build("mcl", where, grid, episode)  # Its weights are those of Alg 1.
     return Scene(np.asarray(found.mass), np.asarray(trusts(scored, episode.poses, episode.ranges)))
 

@@ -1,6 +1,6 @@
 """What the runs say of each claim of the paper: holds, holds in part, does not hold here. Computed, not typed.
 
-A claim is evidence: numbers with intervals, on the side that the claim says or not (:mod:`dsom_jax.statistics`). All
+A claim is evidence: numbers with intervals, on the side that the claim says or not (:mod:`.judging.statistics`). All
 p-values of the report are one family. Intervals of differences draw sequences first and then runs; six are few.
 """
 
@@ -19,8 +19,8 @@ import particles
 import retention
 from lab import Everything
 
-from dsom_jax.run_table import RunTable, from_columns, join, paired
-from dsom_jax.statistics import (
+from dsom_jax.judging.run_table import RunTable, from_columns, join, paired
+from dsom_jax.judging.statistics import (
     Evidence,
     Verdict,
     clustered_bootstrap,

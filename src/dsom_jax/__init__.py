@@ -29,7 +29,7 @@ _PUBLIC = {
     "filters.updates": ("FilterConfig", "World"),
     "geometry": ("compose", "inverse", "relative", "transform_points", "wrap_angle"),
     "lidar": ("LidarConfig", "LidarNoise", "apply_limits", "observe", "scan_image", "scan_points"),
-    "metrics": ("convergence_step", "measure", "pose_error", "retention", "summarize"),
+    "judging.metrics": ("convergence_step", "measure", "pose_error", "retention", "summarize"),
     "montecarlo": ("run", "run_keys", "run_segments"),
     "motion": ("AdditiveMapFrame", "OdometryMotion", "OmniMotion"),
     "nn": (
@@ -44,7 +44,7 @@ _PUBLIC = {
     "proposals.likelihood_grid": ("LikelihoodGrid", "LikelihoodGridConfig", "likelihood_grid"),
     "proposals.uniform": ("FreeSpace", "free_space"),
     "raycast": ("MapTables", "RaycastConfig", "cast_rays", "make_tables"),
-    "run_table": ("RunTable", "paired"),
+    "judging.run_table": ("RunTable", "paired"),
     "sensor": (
         "BeamModel", "LikelihoodField", "ScoreModel", "beam_log_likelihood", "beam_score", "field_log_likelihood",
         "perfect_score",
@@ -52,7 +52,6 @@ _PUBLIC = {
     "simulate.drive": ("DriveConfig", "make_synthetic"),
     "simulate.obstacles": ("add_obstacles", "remove_structure"),
     "simulate.worlds": ("WorldConfig", "make_world"),
-    "statistics": ("Evidence", "Verdict", "corrected", "decide", "holm", "mcnemar", "paired_difference", "signed_rank"),
     "types": ("Filter", "Inputs", "Motion", "Proposal"),
 }  # fmt: skip
 _HOME = {name: module for module, names in _PUBLIC.items() for name in names}

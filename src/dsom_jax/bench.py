@@ -11,15 +11,16 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from dsom_jax import metrics, plotting, report
+from dsom_jax import plotting, report
 from dsom_jax.cli import Advance, parse, progress_bar
 from dsom_jax.data.suite import Suite, load_suite
 from dsom_jax.episode import Episode
 from dsom_jax.errors import UserError, run_cli
 from dsom_jax.filters.methods import METHODS, STANDARD, WEIGHT_POWER, build_filter, network_of
+from dsom_jax.judging import metrics
+from dsom_jax.judging.run_table import RunTable, join, run_rows
 from dsom_jax.montecarlo import Result, run, run_keys, signature
 from dsom_jax.occupancy import OccupancyGrid
-from dsom_jax.run_table import RunTable, join, run_rows
 from dsom_jax.trained import by_kind, check_networks, check_used, find_networks, load_networks
 from dsom_jax.types import Filter, Key, Proposal
 

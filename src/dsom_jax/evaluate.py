@@ -21,11 +21,11 @@ from dsom_jax.data.open_map import load_maps
 from dsom_jax.errors import UserError, run_cli
 from dsom_jax.filters.methods import Settings, make_proposal
 from dsom_jax.geometry import transform_points
+from dsom_jax.judging import quality
 from dsom_jax.lidar import LidarConfig, scan_points
 from dsom_jax.nn import DSOM
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.simulate.worlds import WorldConfig, make_world
-from dsom_jax.training import quality
 from dsom_jax.training.batches import PLAIN, ScanConfig, make_scans
 from dsom_jax.types import Array, Key, Proposal
 
@@ -85,7 +85,7 @@ def main() -> None:
     with Progress(console=report.terminal(stderr=True)) as progress:
         track = partial(progress.track, description="scenes")
         judged = judge_all(track(scenes), sources)
-    results = {name: quality.summarise(part) | {"ms_per_scan": ms} for name, (part, ms) in judged.items()}
+    results = {name: quality.totals(part) | {"ms_per_scan": ms} for name, (part, ms) in judged.items()}
     report.write_json(folder / "evaluate.json", results)
     draw(folder, scenes, lidar, sources, {name: part for name, (part, _) in judged.items()})
     print_table(results)
@@ -161,7 +161,7 @@ def judge_all(scenes: Iterable[Scene], sources: Sources) -> dict[str, tuple[qual
     times: dict[str, list[float]] = {name: [] for name in PROPOSALS}
     for number, scene in enumerate(scenes):
         for name, proposal in sources(number).items():
-            part = quality.judge(proposal, scene.grid, scene.ranges, scene.poses)
+            part = quality.of_scans(proposal, scene.grid, scene.ranges, scene.poses)
             parts[name].append(jax.tree.map(np.asarray, part))
             times[name] += timed(partial(quality.prepare, proposal), scene.ranges[:3])
     joined = {name: jax.tree.map(lambda *leaves: np.concatenate(leaves), *part) for name, part in parts.items()}

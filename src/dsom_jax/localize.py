@@ -11,14 +11,15 @@ import jax
 import numpy as np
 from rich.progress import Progress
 
-from dsom_jax import checkpoint, metrics, report
+from dsom_jax import checkpoint, report
 from dsom_jax.cli import parse
 from dsom_jax.data import RawLog, Report, load_log, load_map
 from dsom_jax.data.cut import segment_indices, splice, to_episode, without_repeats
 from dsom_jax.data.log import limited
 from dsom_jax.errors import UserError, run_cli
 from dsom_jax.filters.methods import DRAWN, REAL, make_filter, make_proposal
-from dsom_jax.judging import Drive, Outcome, save_estimate, scores
+from dsom_jax.judging import metrics
+from dsom_jax.judging.scores import Drive, Outcome, save_estimate, scores
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.montecarlo import run, run_keys
 from dsom_jax.occupancy import OccupancyGrid

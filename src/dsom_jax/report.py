@@ -1,11 +1,11 @@
 """Results as files and tables: ``bench.json``, terminal tables of 100 columns, markdown for pages.
 
 ``bench.json`` holds, beside what was asked for, ``methods``: NAME -> {"global": M, "kidnap": M, "ms_per_step",
-"compilations", "estimate", "estimates"}. M is :func:`dsom_jax.metrics.summarize`; ``ms_per_step`` is the time of one
+"compilations", "estimate", "estimates"}. M is :func:`.judging.metrics.summarize`; ``ms_per_step`` is the time of one
 update of all runs together; ``compilations`` counts the shapes of map and episode that were compiled; ``estimate`` says
 whether M judges the weighted ``mean`` or the heaviest ``cluster``, and ``estimates`` has M for both.
 Values that do not exist (a mean over no runs) are null. ``runs.npz`` (``--per-run``) holds the columns of
-:class:`dsom_jax.run_table.RunTable`, one row for every run.
+:class:`dsom_jax.judging.run_table.RunTable`, one row for every run.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from rich.table import Table
 
 from dsom_jax.atomic import write_atomic
 from dsom_jax.errors import UserError
-from dsom_jax.run_table import RunTable
+from dsom_jax.judging.run_table import RunTable
 
 PHASES = {"global": "Global localization", "kidnap": "Kidnapping"}
 

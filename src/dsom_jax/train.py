@@ -12,12 +12,12 @@ from dsom_jax import checkpoint
 from dsom_jax.cli import parse
 from dsom_jax.data.open_map import load_maps
 from dsom_jax.errors import UserError, run_cli
+from dsom_jax.judging.quality import make_evaluation
 from dsom_jax.nn import DSOM
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.run_folder import Run, check_init, check_new, create, load_init, read_fields, reopen
 from dsom_jax.trainer import Parts, check_length, train
 from dsom_jax.training.batches import make_batch, plain
-from dsom_jax.training.evaluation import make_evaluation
 from dsom_jax.training.loop import (
     TrainConfig,
     TrainState,

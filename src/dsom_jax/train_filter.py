@@ -15,11 +15,11 @@ from dsom_jax.cli import parse
 from dsom_jax.data.open_map import load_maps
 from dsom_jax.data.suite import load_suite
 from dsom_jax.errors import UserError, run_cli
+from dsom_jax.judging.tracking import make_tracking
 from dsom_jax.nn import KINDS
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.run_folder import FilterRun, Run, check_init, check_new, create, load_init, read_fields, reopen
 from dsom_jax.trainer import Parts, check_length, train
-from dsom_jax.training.filter_evaluation import make_tracking
 from dsom_jax.training.filter_loop import FilterTrainConfig, init_filter_state, make_filter_step, stack_maps
 from dsom_jax.training.memory import keep_freed_memory
 from dsom_jax.training.options import override

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from dsom_jax.metrics import Runs, steps_histogram
+from dsom_jax.judging.metrics import Runs, steps_histogram
 from dsom_jax.plotting.common import legend, panels
 
 STYLES = {

@@ -11,10 +11,10 @@ import numpy as np
 
 from dsom_jax import plotting, report
 from dsom_jax.filters import methods
+from dsom_jax.judging.run_table import RunTable, from_columns, join, paired
+from dsom_jax.judging.statistics import Evidence, corrected, rate_evidence, value_evidence
 from dsom_jax.protocol.plan import Plan, Variant, variants
 from dsom_jax.protocol.running import read_entry
-from dsom_jax.run_table import RunTable, from_columns, join, paired
-from dsom_jax.statistics import Evidence, corrected, rate_evidence, value_evidence
 
 COLUMNS = (
     "method",

@@ -23,13 +23,13 @@ from dsom_jax.filters.methods import (
     network_of,
     powers_of,
 )
+from dsom_jax.judging.run_table import columns_of
 from dsom_jax.montecarlo import run_keys
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.proposals.dual_features import with_episode
 from dsom_jax.protocol.digests import clips_digest, map_digest
 from dsom_jax.protocol.plan import Plan, Variant
 from dsom_jax.run_folder import commit
-from dsom_jax.run_table import columns_of
 from dsom_jax.types import Filter, Proposal
 
 Networks = Callable[[Variant], Path | None]

@@ -1,1 +1,1 @@
-"""Training of DSOM: ground truth, losses, batches made on the device, the loop, and one-shot evaluation."""
+"""Training of DSOM: ground truth, losses, batches made on the device, the loop."""

@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dsom_jax import metrics
 from dsom_jax.data import save_tum
 from dsom_jax.episode import Episode
+from dsom_jax.judging import metrics
 from dsom_jax.montecarlo import Result
 from dsom_jax.occupancy import OccupancyGrid, is_free
 

@@ -1,4 +1,4 @@
-"""What every single run came to, so that methods can be compared run by run (:mod:`dsom_jax.statistics`)."""
+"""What every single run came to, so that methods can be compared run by run (:mod:`dsom_jax.judging.statistics`)."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dsom_jax.metrics import Runs
+from dsom_jax.judging.metrics import Runs
 
 
 class RunTable(NamedTuple):

@@ -1,10 +1,10 @@
-"""One-shot quality of a proposal: what its probability map says of one scan whose pose is known."""
+"""One-shot quality of a proposal or a network: what its probability map says of one scan whose pose is known."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -12,14 +12,20 @@ import jax.numpy as jnp
 import numpy as np
 
 from dsom_jax import pose_grid as pg
-from dsom_jax.compiling import run_options
+from dsom_jax.compiling import run_options, training_options
 from dsom_jax.geometry import wrap_angle
+from dsom_jax.lidar import LidarConfig
+from dsom_jax.nn import DSOM, encode_map
+from dsom_jax.nn.dsom import masked_log_softmax, one_scan
 from dsom_jax.occupancy import OccupancyGrid
-from dsom_jax.training import evaluation
-from dsom_jax.training.evaluation import MASS, TOP
+from dsom_jax.training.batches import Batch
 from dsom_jax.training.target import dense, make_target
 from dsom_jax.types import Array, Inputs, Proposal
 
+MASS = 1.0, math.radians(15)
+"""Metres and radians about the truth within which probability counts as being at the right place."""
+TOP = 2.0, math.radians(10)
+"""Within which the most probable cell counts as right."""
 PEAK = 2.0, math.radians(30)
 """Two peaks are further apart than this."""
 MAX_PEAKS = 8
@@ -49,17 +55,21 @@ class Quality(NamedTuple):
 def quality(pm: pg.ProbabilityMap, free: Array, pose: Array) -> Quality:
     """Quality of ``pm`` for the true map-frame pose (3,); ``free`` (H, W) is where PM may have probability."""
     share = pm.mass / pm.mass.sum()
-    best = _pose(pm.pose_grid, jnp.argmax(share))
-    gap = jnp.hypot(*(best - pose)[:2]), jnp.abs(wrap_angle(best[2] - pose[2]))
     i, j, k = (jnp.round(v).astype(jnp.int32) for v in pg.pose_cell(pm.pose_grid, pose))
     at_truth = share[i, j, k % pm.pose_grid.headings]
     return Quality(
         pg.mass_near(pm, pose, *MASS),
-        (gap[0] < TOP[0]) & (gap[1] < TOP[1]),
+        top_is_right(share, pm.pose_grid, pose),
         divergence(share, free, pm.pose_grid, pose),
         peaks(pm),
         jnp.where(share > at_truth, share, jnp.where(share == at_truth, 0.5 * share, 0.0)).sum(),
     )
+
+
+def top_is_right(share: Array, grid: pg.PoseGrid, pose: Array) -> Array:
+    """Whether the most probable cell of ``share`` (H, W, K) is within 2 m and 10 deg of ``pose`` (3,)."""
+    best = _pose(grid, jnp.argmax(share))
+    return (jnp.hypot(*(best - pose)[:2]) < TOP[0]) & (jnp.abs(wrap_angle(best[2] - pose[2])) < TOP[1])
 
 
 def divergence(share: Array, free: Array, grid: pg.PoseGrid, pose: Array) -> Array:
@@ -96,9 +106,9 @@ def prepare(proposal: Proposal, ranges: Array) -> Any:
     return _compiled(_prepare)(proposal, ranges)
 
 
-def judge(proposal: Proposal, grid: OccupancyGrid, ranges: Array, poses: Array) -> Quality:
+def of_scans(proposal: Proposal, grid: OccupancyGrid, ranges: Array, poses: Array) -> Quality:
     """Quality (S,) for scans (S, B) at map-frame poses (S, 3), one after the other; no PM counts as uniform."""
-    return _compiled(_judge)(proposal, grid, ranges, poses)
+    return _compiled(_of_scans)(proposal, grid, ranges, poses)
 
 
 @cache
@@ -111,7 +121,7 @@ def _prepare(proposal: Proposal, ranges: Array) -> Any:
     return proposal.prepare(Inputs(ranges, jnp.zeros(3), jnp.int32(0)))
 
 
-def _judge(proposal: Proposal, grid: OccupancyGrid, ranges: Array, poses: Array) -> Quality:
+def _of_scans(proposal: Proposal, grid: OccupancyGrid, ranges: Array, poses: Array) -> Quality:
 
     def one(scan: tuple[Array, Array]) -> Quality:
         pm = _prepare(proposal, scan[0])
@@ -122,13 +132,54 @@ def _judge(proposal: Proposal, grid: OccupancyGrid, ranges: Array, poses: Array)
     return jax.lax.map(one, (ranges, poses))
 
 
-def summarise(parts: Quality) -> dict[str, float | int]:
+def totals(parts: Quality) -> dict[str, float | int]:
     """Numbers over all scans, as ``evaluate.json`` holds them."""
-    shares = evaluation.summarise(evaluation.Score(parts.mass, parts.top1))
-    return {**shares, "kld": float(np.mean(parts.kld)), "peaks_mean": float(np.mean(parts.peaks))}
+    return {**mass_totals(parts.mass, parts.top1), "kld": float(np.mean(parts.kld)),
+            "peaks_mean": float(np.mean(parts.peaks))}  # fmt: skip
+
+
+def mass_totals(mass: Any, top1: Any) -> dict[str, float | int]:
+    """``mass_median``, ``mass_mean``, ``mass_gt_1pct``, ``mass_gt_10pct`` and ``top1`` over all scans."""
+    mass = np.asarray(mass, np.float64)
+    return {
+        "scans": int(mass.size),
+        "mass_median": float(np.median(mass)),
+        "mass_mean": float(mass.mean()),
+        "mass_gt_1pct": float((mass > 0.01).mean()),
+        "mass_gt_10pct": float((mass > 0.1).mean()),
+        "top1": float(np.asarray(top1).mean()),
+    }
 
 
 def calibration(level: np.ndarray, steps: int = 20) -> tuple[np.ndarray, np.ndarray]:
     """Credible levels p (steps + 1,) and the share of truths inside PM's smallest region of probability p."""
     p = np.linspace(0.0, 1.0, steps + 1)
     return p, (np.asarray(level)[:, None] <= p).mean(0)
+
+
+def of_logits(log_pm: Array, resolution: float, pose: Array) -> tuple[Array, Array]:
+    """``mass`` and ``top1`` of log PM (H, W, K) for the true pose (3,) in its grid's frame (metres from the corner)."""
+    grid = pg.PoseGrid(jnp.zeros(3), *log_pm.shape, resolution)
+    mass = jnp.where(pg.near(grid, pose, *MASS), jnp.exp(log_pm), 0.0).sum()
+    return mass, top_is_right(log_pm, grid, pose)
+
+
+def of_batch(model: DSOM, batch: Batch, lidar: LidarConfig) -> tuple[Array, Array]:
+    """``mass`` and ``top1`` (N, S) of an evaluation view; maps and scans one after the other, to bound the memory."""
+
+    def scored(features: Any, scan: Any) -> tuple[Array, Array]:
+        ranges, conditions, pose = scan
+        logits = one_scan(model, features, model.observation(ranges, lidar, conditions))
+        return of_logits(masked_log_softmax(logits, features.free), model.config.resolution, pose)
+
+    def one_map(part: Batch) -> tuple[Array, Array]:
+        features = encode_map(model, part.occupied, part.free, part.views)
+        return jax.lax.map(partial(scored, features), (part.ranges, part.conditions, part.poses))
+
+    return jax.lax.map(one_map, batch)
+
+
+def make_evaluation(batch: Batch, lidar: LidarConfig) -> Callable[[DSOM], dict[str, float | int]]:
+    """Compiled judging of evaluation views on a fixed batch, as it is done during training."""
+    score = jax.jit(of_batch, static_argnums=2, compiler_options=training_options())
+    return lambda model: mass_totals(*score(model, batch, lidar))

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dsom_jax import judging
 from dsom_jax.data import load_tum
 from dsom_jax.episode import Episode
-from dsom_jax.judging import Drive, Outcome
+from dsom_jax.judging import scores as judging
+from dsom_jax.judging.scores import Drive, Outcome
 from dsom_jax.montecarlo import Result
 from dsom_jax.occupancy import from_cells
 

@@ -58,10 +58,10 @@ def make_tracking(
     def track(params: Any) -> Array:
         return jax.lax.map(lambda part: one(params, key=part[0], window=part[1]), (keys, windows))
 
-    return lambda model: summarise(track(nnx.as_pure(nnx.split(model)[1])))
+    return lambda model: tracked(track(nnx.as_pure(nnx.split(model)[1])))
 
 
-def summarise(error: Array) -> dict[str, float]:
+def tracked(error: Array) -> dict[str, float]:
     """Numbers over sequences: errors (S, L, 2) in metres and radians."""
     distance, turn = np.moveaxis(np.asarray(error, np.float64), -1, 0)
     return {

@@ -5,7 +5,7 @@ Runs of one sequence share its map, scans and kidnapping, and run r of all metho
 means that 100 runs of a sequence are not 100 independent experiments: what is hard for one is hard for all. McNemar's
 and Wilcoxon's tests do not know that and give p-values that are too small; the bootstrap here does, as it draws
 sequences first. Evidence therefore needs both. With as few as six sequences even that interval is on the narrow
-side. Host code, float64 NumPy; intervals for single rates and means are in :mod:`dsom_jax.metrics`.
+side. Host code, float64 NumPy; intervals for single rates and means are in :mod:`dsom_jax.judging.metrics`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from scipy import stats
 
-from dsom_jax.metrics import ratio
+from dsom_jax.judging.metrics import ratio
 
 ALPHA = 0.05
 Outcome = Literal["holds", "holds in part", "does not hold here"]
@@ -70,7 +70,7 @@ def signed_rank(a: Any, b: Any) -> SignedRank:
     """Wilcoxon's signed-rank test of paired values (n,), for errors and steps; zero differences ranked (Pratt).
 
     Pairs in which one is NaN are left out. So are, for steps, the runs that never converged
-    (:attr:`dsom_jax.run_table.RunTable.converging_steps`): whether a method converges at all is :func:`mcnemar`'s
+    (:attr:`.run_table.RunTable.converging_steps`): whether a method converges at all is :func:`mcnemar`'s
     question, and a made-up number of steps would decide the ranks. An infinite error is the worst there is.
     """
     a, b = _paired(a, b, float)
@@ -101,7 +101,7 @@ def clustered_bootstrap(
 
     Each resample draws as many clusters as there are, with replacement, and from each as many of its values. Values of
     one cluster go together: runs of one sequence are not independent, and drawing them one by one
-    (:func:`dsom_jax.metrics.bootstrap`) would take what is one sequence's for everybody's. NaN without values.
+    (:func:`dsom_jax.judging.metrics.bootstrap`) would take what is one sequence's for everybody's. NaN without values.
     """
     values, clusters = np.asarray(values, float), np.asarray(clusters)
     if not len(values):
