@@ -159,7 +159,8 @@ def calibration(level: np.ndarray, steps: int = 20) -> tuple[np.ndarray, np.ndar
 
 def of_logits(log_pm: Array, resolution: float, pose: Array) -> tuple[Array, Array]:
     """``mass`` and ``top1`` of log PM (H, W, K) for the true pose (3,) in its grid's frame (metres from the corner)."""
-    grid = pg.PoseGrid(jnp.zeros(3), *log_pm.shape, resolution)
+    height, width, headings = log_pm.shape
+    grid = pg.PoseGrid(jnp.zeros(3), height, width, headings, resolution)
     mass = jnp.where(pg.near(grid, pose, *MASS), jnp.exp(log_pm), 0.0).sum()
     return mass, top_is_right(log_pm, grid, pose)
 

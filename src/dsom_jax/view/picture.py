@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from dsom_jax.metrics import CONFIDENT, POSITION
+from dsom_jax.judging.metrics import CONFIDENT, POSITION
 from dsom_jax.occupancy import from_cells
 from dsom_jax.plotting.common import legend
 from dsom_jax.plotting.maps import map_view

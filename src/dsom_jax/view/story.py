@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from dsom_jax.metrics import ANGLE, POSITION
+from dsom_jax.judging.metrics import ANGLE, POSITION
 
 VERDICTS = ("localized", "ambiguous", "off_map", "lost")
 """Verdicts that a page has colours for, from the best to the worst."""
