@@ -24,6 +24,7 @@ from dsom_jax.proposals.likelihood_grid import LikelihoodGridConfig
 from dsom_jax.proposals.uniform import free_space
 from dsom_jax.raycast import RaycastConfig, make_tables
 from dsom_jax.sensor import BeamModel, ScoreModel
+from dsom_jax.types import prepare_alone
 
 LIDAR = tiny_world.LIDAR
 STILL = OdometryMotion(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -48,8 +49,11 @@ class Spot:
 
     pm: pg.ProbabilityMap
 
-    def prepare(self, inputs):
-        return self.pm
+    def begin(self):
+        return ()
+
+    def prepare(self, memory, inputs):
+        return self.pm, memory
 
     def sample(self, key, prepared, n):
         return pg.sample(key, prepared, n)
@@ -79,7 +83,7 @@ def episode():
 
 
 compiled_init = jax.jit(lambda f, key: f.init(key))
-compiled_step = jax.jit(lambda f, key, state, inputs: f.step(key, state, inputs, f.prepare(inputs)))
+compiled_step = jax.jit(lambda f, key, state, inputs: f.step(key, state, inputs, prepare_alone(f, inputs)))
 
 
 def init(f, key):

@@ -47,8 +47,11 @@ class Oracle:
     delay: int = field(metadata={"static": True})
     particles: int = field(metadata={"static": True})
 
-    def prepare(self, inputs):
-        return self.truth[inputs.index]
+    def begin(self):
+        return ()
+
+    def prepare(self, memory, inputs):
+        return self.truth[inputs.index], memory
 
     def init(self, key):
         return State(jax.random.uniform(key, (self.particles, 3)))

@@ -163,7 +163,7 @@ def test_an_update_resamples_softly_moves_and_weighs(kind, monkeypatch):
 
 def test_the_cell_of_pfrnn_reads_scan_and_motion_and_its_head_corrects():
     model, filter, rng = MODELS["pfrnn"], make("pfrnn", 5), np.random.default_rng(0)
-    code = filter.prepare(Inputs(jnp.full(32, 2.0), jnp.zeros(3), jnp.int32(0)))
+    code, _ = filter.prepare((), Inputs(jnp.full(32, 2.0), jnp.zeros(3), jnp.int32(0)))
     poses = jnp.stack([TRUTH] * 5) + jnp.arange(5)[:, None] * 0.1
     hidden, noise = (jnp.asarray(rng.normal(size=(5, PFRNN.hidden)), jnp.float32) for _ in range(2))
     odometry = jnp.array([0.3, -0.1, 0.2])
@@ -183,7 +183,7 @@ def test_the_estimate_is_that_of_the_weights(episode):
     uneven = jax.nn.log_softmax(jnp.linspace(0.0, 9.0, 24))
 
     def step(key):
-        return filter.step(key, filter.init(key)._replace(log_weights=uneven), now, filter.prepare(now))
+        return filter.step(key, filter.init(key)._replace(log_weights=uneven), now, filter.prepare((), now)[0])
 
     state, info = jax.jit(step)(jax.random.key(0))
     weights = np.exp(np.asarray(state.log_weights, np.float64))
@@ -205,7 +205,9 @@ def test_a_finer_map_is_brought_to_the_scale_of_the_network():
 def test_update(kind, episode):
     chex.clear_trace_counter()
     filter = make(kind, 24, PRIOR)
-    step = jax.jit(chex.assert_max_traces(lambda f, key, state, now: f.step(key, state, now, f.prepare(now)), n=1))
+    step = jax.jit(
+        chex.assert_max_traces(lambda f, key, state, now: f.step(key, state, now, f.prepare((), now)[0]), n=1)
+    )
     state = filter.init(jax.random.key(0))
     for t in range(3):
         state, info = step(filter, jax.random.key(t), state, inputs_at(episode, t))
@@ -250,5 +252,5 @@ def test_beams_are_thinned_to_what_the_network_reads():
     assert filter.beam_step == 12 and filter.lidar.beams == 30
     ranges = jnp.linspace(0.5, 4.5, 360)
     expected = MODELS["pf_net"].observation.scan_code(ranges[::12], lidar.every(12))
-    read = filter.prepare(Inputs(ranges, jnp.zeros(3), jnp.int32(0)))
+    read, _ = filter.prepare((), Inputs(ranges, jnp.zeros(3), jnp.int32(0)))
     jax.tree.map(np.testing.assert_array_equal, read, expected)

@@ -30,12 +30,12 @@ from dsom_jax.proposals.markov_grid import MarkovGrid
 from dsom_jax.proposals.markov_network import MarkovNetwork
 from dsom_jax.proposals.uniform import free_space
 from dsom_jax.sensor import BeamModel
-from dsom_jax.types import Inputs
+from dsom_jax.types import Inputs, prepare_alone
 from filters_kit import LIDAR, NETWORK, decided_network
 
 MODEL = BeamModel(sigma_hit=0.2, temper=0.2, range_max=LIDAR.range_max)
 GRID = LikelihoodGridConfig(resolution=0.25, headings=16, angles_per_heading=2, beams=32, model=MODEL)
-prepare = jax.jit(lambda proposal, inputs: proposal.prepare(inputs))
+prepare = jax.jit(prepare_alone)
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import tiny_world
-from dsom_jax.filters.adam import AdamRecalling
+from dsom_jax.filters.adam import AdamMCL
 from dsom_jax.filters.adam_memory import AdamMemory
 from dsom_jax.filters.adam_robust import AdamRobust, RobustConfig, RobustState
 from dsom_jax.filters.methods import Settings, build_filter, make_filter
@@ -25,7 +25,7 @@ from dsom_jax.proposals.likelihood_grid import LikelihoodGridConfig, likelihood_
 from dsom_jax.proposals.markov_grid import MarkovGrid, MarkovGridConfig
 from dsom_jax.proposals.uniform import free_space
 from dsom_jax.raycast import RaycastConfig, make_tables
-from dsom_jax.types import Inputs
+from dsom_jax.types import Inputs, prepare_alone
 from filters_kit import BEAM, GRID, LIDAR
 from reference import markov
 
@@ -116,7 +116,7 @@ def test_an_update_is_bayes_rule(room):
     rng = np.random.default_rng(0)
     before = np.asarray(room.begin()) * rng.random(room.begin().shape)
     before /= before.sum()
-    recollection, after = room.recall(jnp.asarray(before, jnp.float32), inputs)
+    recollection, after = room.prepare(jnp.asarray(before, jnp.float32), inputs)
     moved = dense(room, room.predict(jnp.asarray(before, jnp.float32), inputs.odometry)).astype(np.float64)
     prior = (1 - 1e-4) * moved / moved.sum() + 1e-4 * dense(room, room.begin())
     likelihood = np.exp(dense(room, room.likelihood.log_likelihood(inputs.ranges)))
@@ -130,17 +130,17 @@ def test_an_update_is_bayes_rule(room):
 
 def test_the_first_scan_is_that_of_the_likelihood_grid(memory):
     first = jax.tree.map(lambda leaf: leaf[0], tiny_world.drive().inputs)
-    plain = memory.likelihood.prepare(first)
-    belief = memory.prepare(first).posterior
+    plain = prepare_alone(memory.likelihood, first)
+    belief = prepare_alone(memory, first).posterior
     np.testing.assert_allclose(belief.mass / belief.cumulative[-1], plain.mass / plain.cumulative[-1], atol=1e-7)
     # Whatever its number, and the way that is said to lie behind: nothing is known of where it began.
-    late = memory.prepare(first._replace(index=jnp.int32(7), odometry=jnp.array([2.0, 0.0, 1.0]))).posterior
+    late = prepare_alone(memory, first._replace(index=jnp.int32(7), odometry=jnp.array([2.0, 0.0, 1.0]))).posterior
     np.testing.assert_array_equal(late.mass, belief.mass)
 
 
 def test_log_prior_is_the_density_of_the_belief_before_the_scan(memory):
     first = jax.tree.map(lambda leaf: leaf[0], tiny_world.drive().inputs)
-    prepared = memory.prepare(first)
+    prepared = prepare_alone(memory, first)
     poses, _ = memory.sample(jax.random.key(0), prepared, 50)
     space = free_space(tiny_world.grid())
     np.testing.assert_allclose(memory.log_prior(prepared, poses), space.log_density_value, atol=1e-4)
@@ -166,7 +166,7 @@ def test_shares_of_grid_and_particles(filters):
     """Weights of particles and of the grid's poses in an update without evidence: 1 - a and a, by Bayes' rule."""
     blind = Inputs(jnp.full(LIDAR.beams, jnp.nan), jnp.zeros(3), jnp.int32(0))
     step = jax.jit(lambda f, key, state, prepared: f.step(key, state, blind, prepared)[0])
-    prepared, belief = filters[0].recall(filters[0].begin(), blind)
+    prepared, belief = filters[0].prepare(filters[0].begin(), blind)
     poses, _ = filters[0].space.sample(jax.random.key(1), None, 150)
     state = RobustState(poses, jnp.full(150, -math.log(150)), jnp.float32(0.5), jnp.int32(2))
     masses = {}
@@ -216,7 +216,7 @@ def test_settings_reach_the_memory(memory):
 
 def test_what_the_memory_says_counts_as_much_as_the_filter_is_lost(filters):
     """With the share at both of its ends, and between them."""
-    prepared = filters[0].proposal.prepare(jax.tree.map(lambda leaf: leaf[0], tiny_world.drive().inputs))
+    prepared = prepare_alone(filters[0], jax.tree.map(lambda leaf: leaf[0], tiny_world.drive().inputs))
     state = filters[0].init(jax.random.key(0))._replace(updates=jnp.int32(3))
     poses = tiny_world.drive().poses[:1]
     prior = filters[0].proposal.log_prior(prepared, poses)
@@ -226,18 +226,13 @@ def test_what_the_memory_says_counts_as_much_as_the_filter_is_lost(filters):
         np.testing.assert_allclose([said[0], filters[0]._log_kept(state)], np.log([share, 1 - share]), rtol=1e-5)
 
 
-def test_no_update_without_memory_by_mistake(filters):
-    with pytest.raises(TypeError, match="recall"):
-        filters[0].prepare(jax.tree.map(lambda leaf: leaf[0], tiny_world.drive().inputs))
-
-
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 def test_odometry_that_is_no_number_moves_nothing(room, bad):
     belief = room.begin() * jax.random.uniform(jax.random.key(0), room.begin().shape)
     ranges = jnp.full(LIDAR.beams, 1.1)
-    spoilt, after = room.recall(belief, Inputs(ranges, jnp.array([0.3, bad, 0.2]), jnp.int32(4)))
+    spoilt, after = room.prepare(belief, Inputs(ranges, jnp.array([0.3, bad, 0.2]), jnp.int32(4)))
     # A robot that starts there has not moved either.
-    first, expected = room.recall(belief, Inputs(ranges, jnp.zeros(3), jnp.int32(0)))
+    first, expected = room.prepare(belief, Inputs(ranges, jnp.zeros(3), jnp.int32(0)))
     np.testing.assert_array_equal(after, expected)
     np.testing.assert_array_equal(spoilt.prior.mass, first.prior.mass)
 
@@ -254,22 +249,20 @@ def test_alg_1_redraws_from_all_scans_so_far(memory):
     """A scan that says nothing: without trust in any particle, all come from what the drive has told."""
     episode = tiny_world.drive()
     filter = make_filter("adam", memory, tiny_world.grid(), LIDAR, Settings(particles=60))
-    assert isinstance(filter, AdamRecalling)
-    recall, belief = jax.jit(filter.recall), filter.begin()
+    assert isinstance(filter, AdamMCL)
+    prepare, belief = jax.jit(filter.prepare), filter.begin()
     for t in range(len(episode.ranges)):
-        _, belief = recall(belief, jax.tree.map(lambda leaf, t=t: leaf[t], episode.inputs))
+        _, belief = prepare(belief, jax.tree.map(lambda leaf, t=t: leaf[t], episode.inputs))
     blind = Inputs(jnp.full(LIDAR.beams, jnp.nan), jnp.zeros(3), jnp.int32(len(episode.ranges)))
     state = filter.init(jax.random.key(0))
     lost = state._replace(weights=jnp.zeros(60).at[0].set(1e-6), updates=jnp.int32(9))
-    poses = filter.step(jax.random.key(1), lost, blind, recall(belief, blind)[0])[0].poses
+    poses = filter.step(jax.random.key(1), lost, blind, prepare(belief, blind)[0])[0].poses
     off = np.asarray(poses - episode.poses[-1])
     assert (np.hypot(off[:, 0], off[:, 1]) < 0.5).mean() > 0.9
-    with pytest.raises(TypeError, match="AdamRecalling: the proposal has a past"):
-        filter.prepare(blind)
 
 
 def test_pictures_show_the_belief_after_the_scan(memory):
-    prepared = memory.prepare(jax.tree.map(lambda leaf: leaf[3], tiny_world.drive().inputs))
+    prepared = prepare_alone(memory, jax.tree.map(lambda leaf: leaf[3], tiny_world.drive().inputs))
     shown = maps._pm_of(prepared)["pm"]
     # In units of the best cell, a peaked PM has little mass.
     assert shown is prepared.posterior.mass and float(shown.sum()) < 0.5 * float(prepared.prior.mass.sum())
@@ -277,7 +270,7 @@ def test_pictures_show_the_belief_after_the_scan(memory):
 
 def test_methods_with_the_memory_are_offered(memory):
     made = {"likelihood_grid": memory.likelihood}
-    for name, kind in (("adam_markov_grid", AdamRecalling), ("robust_markov_grid", AdamMemory)):
+    for name, kind in (("adam_markov_grid", AdamMCL), ("robust_markov_grid", AdamMemory)):
         own = {"particles": 20, "t_cut": 0.6, "sources": made}
         built = build_filter(name, tiny_world.grid(), LIDAR, **own)
         assert isinstance(built, kind) and built.proposal.likelihood.expected is memory.likelihood.expected

@@ -12,7 +12,7 @@ import pytest
 
 import tiny_world
 from dsom_jax import pose_grid as pg
-from dsom_jax.filters.adam import AdamRecalling
+from dsom_jax.filters.adam import AdamMCL
 from dsom_jax.filters.adam_memory import AdamMemory
 from dsom_jax.filters.methods import STANDARD, Settings, build_filter, make_filter, network_of
 from dsom_jax.geometry import wrap_angle
@@ -89,7 +89,7 @@ def test_a_memory_of_the_network_multiplies_its_maps_along_the_drive(parts, temp
     scans = [Inputs(tiny_world.drive().ranges[t], jnp.full(3, jnp.nan), jnp.int32(n)) for n, t in enumerate((3, 9))]
     belief, expected = memory.begin(), 1.0
     for scan in scans:
-        prepared, belief = memory.recall(belief, scan)
+        prepared, belief = memory.prepare(belief, scan)
         log_pm = Hybrid(*parts, HybridConfig(floor=0.02)).log_network(scan)
         # The parts' own temper is 0.5.
         log_likelihood = temper / 0.5 * np.asarray(parts[0].log_likelihood(scan.ranges), np.float64)
@@ -103,7 +103,7 @@ def test_a_memory_of_the_network_multiplies_its_maps_along_the_drive(parts, temp
 def test_filters_that_remember_what_the_network_said_are_offered(parts):
     made = {"likelihood_grid": parts[0], "dsom": parts[1]}
     for source, worth in (("dsom", Settings().markov_dsom), ("hybrid", Settings().markov_hybrid)):
-        for algorithm, kind in (("adam", AdamRecalling), ("robust", AdamMemory)):
+        for algorithm, kind in (("adam", AdamMCL), ("robust", AdamMemory)):
             name = f"{algorithm}_markov_{source}"
             assert network_of(name) == "dsom" and name not in STANDARD
             built = build_filter(name, tiny_world.grid(), LIDAR, particles=20, t_cut=0.6, sources=made)

@@ -34,13 +34,16 @@ class Toy:
     table: Any
     n: int = field(default=203, metadata={"static": True})
 
-    def prepare(self, inputs: Inputs):
+    def begin(self):
+        return ()
+
+    def prepare(self, memory, inputs: Inputs):
         kernel = inputs.ranges[:9].reshape(3, 3, 1, 1)
         layout = ("NHWC", "HWIO", "NHWC")
         image = jax.lax.conv_general_dilated(
             self.table[None, :, :, None], kernel, (1, 1), "SAME", dimension_numbers=layout
         )
-        return jax.nn.softmax(image.ravel())
+        return jax.nn.softmax(image.ravel()), memory
 
     def init(self, key):
         return jax.random.uniform(key, (self.n, 3), maxval=10.0)
@@ -67,8 +70,8 @@ class Walk(Toy):
 
     n: int = field(default=7, metadata={"static": True})
 
-    def prepare(self, inputs):
-        return self.table.sum() + inputs.ranges[0]
+    def prepare(self, memory, inputs):
+        return self.table.sum() + inputs.ranges[0], memory
 
     def step(self, key, state, inputs, prepared):
         poses = state + inputs.odometry + 0.3 * jax.random.normal(key, state.shape)
@@ -107,7 +110,7 @@ def test_against_a_plain_loop():
     state = filter.init(jax.random.fold_in(key, 0))
     for t in range(5):
         inputs = Inputs(drive.ranges[t], drive.odometry[t], jnp.int32(t))
-        state, info = filter.step(jax.random.fold_in(key, t + 1), state, inputs, filter.prepare(inputs))
+        state, info = filter.step(jax.random.fold_in(key, t + 1), state, inputs, filter.prepare((), inputs)[0])
         np.testing.assert_allclose(result.info.mean[1, t], info.mean, atol=1e-5)
     np.testing.assert_allclose(result.state[1], state, atol=1e-5)
 
@@ -124,6 +127,21 @@ def test_run_r_of_a_batch_equals_the_same_run_alone_bit_for_bit(runs):
     batch = montecarlo.run(toy(), episode(), keys)
     part = montecarlo.run(toy(), episode(), keys[-runs:])
     same(jax.tree.map(lambda leaf: leaf[-runs:], batch), part)
+
+
+def test_a_memory_is_carried_once_for_all_runs():
+    @jax.tree_util.register_dataclass
+    @dataclass(frozen=True)
+    class Sum(Walk):
+        def begin(self):
+            return jnp.zeros(12)
+
+        def prepare(self, memory, inputs):
+            return (memory + inputs.ranges)[0], memory + inputs.ranges
+
+    info = montecarlo.run(Sum(walk().table), episode(), montecarlo.run_keys(0, 0, 3)).info
+    expected = np.broadcast_to(np.cumsum(np.asarray(episode().ranges)[:, 0]), (3, 5))
+    np.testing.assert_allclose(info.lost, expected, rtol=1e-6)
 
 
 def test_same_seed_same_bits():
@@ -157,9 +175,9 @@ def test_prepare_is_computed_once_per_update_for_all_runs():
     @jax.tree_util.register_dataclass
     @dataclass(frozen=True)
     class Watched(Walk):
-        def prepare(self, inputs):
+        def prepare(self, memory, inputs):
             jax.debug.callback(calls.append, inputs.index)
-            return super().prepare(inputs)
+            return super().prepare(memory, inputs)
 
     jax.block_until_ready(montecarlo.run(Watched(walk().table, 21), episode(), montecarlo.run_keys(0, 0, 9)))
     jax.effects_barrier()
@@ -173,19 +191,6 @@ def test_kept_states_are_those_of_run_0_after_the_update():
     same(whole.kept[0], montecarlo.run(walk(), start, keys).state[0])
     same(whole.kept[1], whole.state[0])
     assert montecarlo.run(walk(), episode(), keys).kept is None
-
-
-def test_segments():
-    drives = [episode(seed=s) for s in range(2)]
-    keys = jnp.stack([montecarlo.run_keys(0, s, 3) for s in range(2)])
-    stacked = montecarlo.run_segments(walk(), drives, keys, keep=(0,))
-    assert stacked.info.mean.shape == (2, 3, 5, 3) and stacked.kept.shape == (2, 1, 7, 3)
-    same(jax.tree.map(lambda leaf: leaf[1], stacked), montecarlo.run(walk(), drives[1], keys[1], keep=(0,)))
-
-
-def test_segments_of_different_lengths_are_refused():
-    with pytest.raises(ValueError, match="differ in shape"):
-        montecarlo.run_segments(walk(), [episode(3), episode(4)], jnp.stack([montecarlo.run_keys(0, 0, 1)] * 2))
 
 
 def test_no_runs_are_refused():

@@ -21,13 +21,13 @@ from dsom_jax.proposals.likelihood_grid import LikelihoodGridConfig, likelihood_
 from dsom_jax.proposals.uniform import free_space
 from dsom_jax.raycast import RaycastConfig, make_tables
 from dsom_jax.sensor import BeamModel
-from dsom_jax.types import Inputs
+from dsom_jax.types import Inputs, prepare_alone
 from reference import beam_grid, se2
 
 LIDAR = tiny_world.LIDAR
 MODEL = BeamModel(sigma_hit=0.2, temper=0.5, range_max=LIDAR.range_max)
 CONFIG = LikelihoodGridConfig(resolution=0.25, headings=16, angles_per_heading=2, beams=32, model=MODEL)
-prepare = jax.jit(lambda proposal, inputs: proposal.prepare(inputs))
+prepare = jax.jit(prepare_alone)
 sample = jax.jit(lambda proposal, key, prepared, n: proposal.sample(key, prepared, n), static_argnums=3)
 log_density = jax.jit(lambda proposal, pm, poses: proposal.log_density(pm, poses))
 

@@ -27,7 +27,7 @@ from dsom_jax.filters.methods import build_filter
 from dsom_jax.raycast import cast_rays
 from dsom_jax.resampling import pick
 from dsom_jax.sensor import beam_log_likelihood, beam_score
-from dsom_jax.types import Inputs
+from dsom_jax.types import Inputs, prepare_alone
 
 METHODS = {"adam": "adam_likelihood_grid", "mcl": "mcl", "robust": "robust_likelihood_grid"}
 Parts = dict[str, tuple[Callable[..., Any], tuple[Any, ...]]]
@@ -59,7 +59,7 @@ def method_times(filter: Any, episode: Episode, runs: int, repeats: int, warm: i
     first = jax.tree.map(lambda leaf: leaf[:warm], episode)
     states = montecarlo.run(filter, first, keys).state
     now = jax.tree.map(lambda leaf: leaf[warm], episode.inputs)
-    prepare, step = compiled(lambda f, now: f.prepare(now)), compiled(all_runs)
+    prepare, step = compiled(prepare_alone), compiled(all_runs)
     prepared = prepare(filter, now)
     times = {"step": measure(lambda: step(filter, keys, states, now, prepared), repeats)}
     if prepared is not None:

@@ -99,7 +99,7 @@ def follow(belief: Judged, inputs: Inputs) -> Array:
     likelihood = belief.likelihood
 
     def update(before: Array, now: Inputs) -> tuple[Array, Array]:
-        _, after = belief.recall(before, now)
+        _, after = belief.prepare(before, now)
         cell, k = jnp.divmod(jnp.argmax(after), after.shape[1])
         i, j = jnp.divmod(likelihood.cells[cell], likelihood.pose_grid.width)
         sensor = pose_grid.cell_pose(likelihood.pose_grid, i, j, k)

@@ -22,6 +22,7 @@ from dsom_jax.nn import encode_map
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.plotting.common import log_ticks
 from dsom_jax.proposals.dsom import dsom
+from dsom_jax.types import prepare_alone
 
 NAME = "cost"
 FILTERS = ("mcl", "adam_dsom", "robust_dsom", "pf_net", "pfrnn")
@@ -48,7 +49,7 @@ def updates(config: Config, lab: Lab) -> dict[str, Any]:
     times = {}
     for name in FILTERS:
         filter = lab.build(name, where, grid, episode, config.particles)
-        prepare, step = compiled(lambda f, now: f.prepare(now)), compiled(lambda f, *rest: f.step(*rest))
+        prepare, step = compiled(prepare_alone), compiled(lambda f, *rest: f.step(*rest))
         start = time.perf_counter()
         prepared = jax.block_until_ready(prepare(filter, now))
         key = jax.random.key(lab.seed)
@@ -74,7 +75,7 @@ def sizes(config: Config, lab: Lab) -> dict[str, Any]:
         start = time.perf_counter()
         proposal = jax.block_until_ready(dsom(lab.networks["dsom"], big, lab.suite.lidar))
         encoding = time.perf_counter() - start
-        prepare = compiled(lambda p, now: p.prepare(now)).lower(proposal, now).compile()
+        prepare = compiled(prepare_alone).lower(proposal, now).compile()
         row = {"metres": big.size[0], "cells": big.shape[0], "free_m2": float(big.free.sum()) * big.resolution**2,
                "pm_mb": memory(prepare), "pm": timed(partial(prepare, proposal, now), repeats),
                "map_first_s": encoding, "map_mb": memory(map_encoder(lab.networks["dsom"], big))}  # fmt: skip

@@ -25,7 +25,7 @@ from dsom_jax.judging.statistics import clustered_bootstrap
 from dsom_jax.lidar import LidarConfig, scan_points
 from dsom_jax.occupancy import OccupancyGrid, from_cells
 from dsom_jax.plotting.common import legend
-from dsom_jax.types import Array, Inputs, Key, Proposal
+from dsom_jax.types import Array, Inputs, Key, Proposal, prepare_alone
 
 NAME = "multimodal"
 _UNSEEN = 0x3A5E
@@ -121,7 +121,7 @@ def shares(proposal: Any, ranges: Array, right: Array) -> tuple[Array, Array]:
     """Number of peaks (S,) and probability near each right pose (S, m), for scans (S, B) and poses (S, m, 3)."""
 
     def one(scan: tuple[Array, Array]) -> tuple[Array, Array]:
-        pm = proposal.prepare(Inputs(scan[0], jnp.zeros(3), jnp.int32(0)))
+        pm = prepare_alone(proposal, Inputs(scan[0], jnp.zeros(3), jnp.int32(0)))
         return quality.peaks(pm), jax.vmap(lambda pose: pg.mass_near(pm, pose, *quality.MASS))(scan[1])
 
     return jax.lax.map(one, (ranges, right))

@@ -34,9 +34,13 @@ class SideBySide:
     values: Array
     change: Change = field(metadata={"static": True})
 
-    def prepare(self, inputs: Inputs) -> Any:
+    def begin(self) -> Any:
         """The filter's own."""
-        return self.filter.prepare(inputs)
+        return self.filter.begin()
+
+    def prepare(self, memory: Any, inputs: Inputs) -> tuple[Any, Any]:
+        """The filter's own."""
+        return self.filter.prepare(memory, inputs)
 
     def init(self, key: Key) -> Any:
         """The same start for all: leaves (V, ...)."""

@@ -30,7 +30,7 @@ _PUBLIC = {
     "geometry": ("compose", "inverse", "relative", "transform_points", "wrap_angle"),
     "lidar": ("LidarConfig", "LidarNoise", "apply_limits", "observe", "scan_image", "scan_points"),
     "judging.metrics": ("convergence_step", "measure", "pose_error", "retention", "summarize"),
-    "montecarlo": ("run", "run_keys", "run_segments"),
+    "montecarlo": ("run", "run_keys"),
     "motion": ("AdditiveMapFrame", "OdometryMotion", "OmniMotion"),
     "nn": (
         "DSOM", "DSOMConfig", "PFNet", "PFNetConfig", "PFRNN", "PFRNNConfig", "create", "create_pf_net", "create_pfrnn",

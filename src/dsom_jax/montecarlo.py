@@ -19,7 +19,7 @@ from jax.sharding import PartitionSpec as P
 
 from dsom_jax.compiling import run_options
 from dsom_jax.episode import Episode
-from dsom_jax.types import Array, Filter, Inputs, Key, Remembering
+from dsom_jax.types import Array, Filter, Inputs, Key
 
 
 class Result(NamedTuple):
@@ -62,46 +62,43 @@ def run(filter: Filter, episode: Episode, keys: Key, keep: Sequence[int] = ()) -
     return Result(info, state, jax.tree.map(lambda leaf: leaf[0], kept))
 
 
-def run_segments(filter: Filter, episodes: Sequence[Episode], keys: Key, keep: Sequence[int] = ()) -> Result:
-    """Run S episodes of one shape, each from scratch, with keys (S, R): leaves of the result are (S, ...)."""
-    shapes = {episode.ranges.shape for episode in episodes}
-    if len(shapes) != 1:
-        raise ValueError(f"run_segments: episodes differ in shape (T, B): {sorted(shapes)}")
-    results = [run(filter, episode, k, keep) for episode, k in zip(episodes, keys, strict=True)]
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *results)
-
-
 def signature(filter: Filter, episode: Episode) -> Any:
     """Hashable: two calls of :func:`run` with equal signatures and numbers of runs share one compilation."""
     leaves, structure = jax.tree.flatten((filter, episode))
     return structure, tuple((jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
 
 
+def start(filter: Filter, keys: Key) -> tuple[Any, Any]:
+    """Memory, one for all runs, and states (R, ...) before the first update; keys (R,)."""
+    return filter.begin(), jax.vmap(filter.init)(_fold(keys, 0))
+
+
+def update(filter: Filter, keys: Key, memory: Any, states: Any, inputs: Inputs) -> tuple[Any, Any, Any]:
+    """One update of R runs: memory, states (R, ...) and info (R, ...) after it; pure, what :func:`run` scans over.
+
+    keys (R,) are those of the runs, the same at every update. To particles, an increment of the odometry that is not
+    finite is none: one such would leave them without a pose for good.
+    """
+    prepared, memory = filter.prepare(memory, inputs)
+    told = inputs._replace(odometry=jnp.where(jnp.isfinite(inputs.odometry).all(), inputs.odometry, 0.0))
+    step_keys = _fold(keys, inputs.index + 1)
+    states, info = jax.vmap(lambda key, state: filter.step(key, state, told, prepared))(step_keys, states)
+    return memory, states, info
+
+
 def simulate(filter: Filter, inputs: Inputs, keep: Array | None, keys: Key) -> tuple[Any, Any, Any]:
     """The pure computation of one device: info (R, T, ...), state (R, ...), kept (1, K, ...).
 
-    inputs (T, ...), keys (R,); ``keep`` (K,) are updates, or None. To particles, an increment of the odometry that is
-    not finite is none: one such would leave them without a pose for good.
+    inputs (T, ...), keys (R,); ``keep`` (K,) are updates, or None.
     """
 
-    def update(carry: tuple[Any, Any], now: Inputs) -> tuple[Any, Any]:
-        memory, states = carry
-        prepared, memory = recall(filter, memory, now)
-        step_keys = _fold(keys, now.index + 1)
-        told = now._replace(odometry=jnp.where(jnp.isfinite(now.odometry).all(), now.odometry, 0.0))
-        states, info = jax.vmap(lambda key, state: filter.step(key, state, told, prepared))(step_keys, states)
+    def one(carry: tuple[Any, Any], now: Inputs) -> tuple[Any, Any]:
+        memory, states, info = update(filter, keys, *carry, now)
         return (memory, states), (info, None if keep is None else jax.tree.map(lambda leaf: leaf[0], states))
 
-    memory = filter.begin() if isinstance(filter, Remembering) else None
-    start = jax.vmap(filter.init)(_fold(keys, 0))
-    (_, states), (info, shown) = jax.lax.scan(update, (memory, start), inputs)
+    (_, states), (info, shown) = jax.lax.scan(one, start(filter, keys), inputs)
     by_run = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), info)
     return by_run, states, jax.tree.map(lambda leaf: leaf[keep][None], shown)
-
-
-def recall(filter: Filter, memory: Any, now: Inputs) -> tuple[Any, Any]:
-    """What all runs share at one update, and the memory after it; None for filters that treat each scan anew."""
-    return filter.recall(memory, now) if isinstance(filter, Remembering) else (filter.prepare(now), None)
 
 
 def _fold(keys: Key, number: Array | int) -> Key:

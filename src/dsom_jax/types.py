@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol
 
 import jax
+import jax.numpy as jnp
 
 Array = jax.Array
 Key = jax.Array
@@ -40,8 +41,12 @@ class Motion(Protocol):
 class Proposal(Protocol):
     """Samplable observation model q(x | z, map): what DSOM is in the paper."""
 
-    def prepare(self, inputs: Inputs) -> Any:
-        """Whatever one scan needs once, shared by all particles and all runs."""
+    def begin(self) -> Any:
+        """Memory before the first scan, a pytree; ``()`` if each scan is taken on its own."""
+        ...
+
+    def prepare(self, memory: Any, inputs: Inputs) -> tuple[Any, Any]:
+        """Whatever one scan needs once, shared by all particles and all runs, and the memory after it."""
         ...
 
     def sample(self, key: Key, prepared: Any, n: int) -> tuple[Array, Array]:
@@ -52,8 +57,12 @@ class Proposal(Protocol):
 class Filter(Protocol):
     """A particle filter as pure functions; ``Info`` has ``mean``, ``cluster``, ``lost`` (see filters.common)."""
 
-    def prepare(self, inputs: Inputs) -> Any:
-        """The part of an update that no particle enters."""
+    def begin(self) -> Any:
+        """Memory before the first update, one for all runs; ``()`` if the part that they share has no past."""
+        ...
+
+    def prepare(self, memory: Any, inputs: Inputs) -> tuple[Any, Any]:
+        """The part of an update that no particle enters, and the memory after it."""
         ...
 
     def init(self, key: Key) -> Any:
@@ -65,14 +74,6 @@ class Filter(Protocol):
         ...
 
 
-@runtime_checkable
-class Remembering(Protocol):
-    """What a filter has beside :class:`Filter` if the part of an update that no particle enters has a past."""
-
-    def begin(self) -> Any:
-        """Memory before the first update, one for all runs."""
-        ...
-
-    def recall(self, memory: Any, inputs: Inputs) -> tuple[Any, Any]:
-        """In place of ``prepare``: what the update needs, and the memory after it."""
-        ...
+def prepare_alone(source: Proposal | Filter, inputs: Inputs) -> Any:
+    """What is prepared for a scan whose past is unknown: it starts there, whatever the odometry says."""
+    return source.prepare(source.begin(), inputs._replace(odometry=jnp.full(3, jnp.nan)))[0]

@@ -9,9 +9,7 @@ import jax
 
 from dsom_jax import checks
 from dsom_jax.filters.common import Info, ParticleState
-from dsom_jax.filters.memory import Recalling
 from dsom_jax.filters.updates import SharedProposal, mixture_update
-from dsom_jax.proposals.markov_grid import MarkovGrid
 from dsom_jax.types import Array, Inputs, Key
 
 
@@ -34,18 +32,6 @@ class AdamMCL(SharedProposal):
         k_split, k_update = jax.random.split(key)
         high = (state.updates == 0) | trusted(k_split, state.weights, self.t_cut)
         return mixture_update(k_update, state, high, inputs, self.world, self.proposal, prepared, self.config)
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class AdamRecalling(Recalling, AdamMCL):
-    """Alg 1 whose PM is the belief after all scans so far in place of the last one's: where one scan says little.
-
-    Attributes:
-        proposal: the likelihood grid with its belief.
-    """
-
-    proposal: MarkovGrid
 
 
 def trusted(key: Key, trust: Array, t_cut: float) -> Array:

@@ -18,7 +18,6 @@ import jax.numpy as jnp
 
 from dsom_jax import checks
 from dsom_jax.filters.adam_robust import AdamRobust, RobustState
-from dsom_jax.filters.memory import Recalling
 from dsom_jax.occupancy import is_free
 from dsom_jax.proposals.markov_grid import MarkovGrid, Recollection
 from dsom_jax.types import Array
@@ -26,7 +25,7 @@ from dsom_jax.types import Array
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class AdamMemory(Recalling, AdamRobust):
+class AdamMemory(AdamRobust):
     """Adaptive mixture of particles and grid localization.
 
     Attributes:

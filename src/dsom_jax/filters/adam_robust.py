@@ -107,9 +107,13 @@ class AdamRobust:
     motion: Motion = field(metadata={"static": True})
     config: RobustConfig = field(metadata={"static": True})
 
-    def prepare(self, inputs: Inputs) -> Any:
-        """The proposal for this scan."""
-        return self.proposal.prepare(inputs)
+    def begin(self) -> Any:
+        """The proposal's memory."""
+        return self.proposal.begin()
+
+    def prepare(self, memory: Any, inputs: Inputs) -> tuple[Any, Any]:
+        """The proposal for this scan, and its memory."""
+        return self.proposal.prepare(memory, inputs)
 
     def init(self, key: Key) -> RobustState:
         """Uniform particles; the first update replaces them all."""

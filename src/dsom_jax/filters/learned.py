@@ -54,9 +54,13 @@ class Learned:
         """The network with its weights."""
         return nnx.merge(self.graph, self.weights)
 
-    def prepare(self, inputs: Inputs) -> ScanCode:
+    def begin(self) -> tuple[()]:
+        """No memory: each scan is taken on its own."""
+        return ()
+
+    def prepare(self, memory: tuple[()], inputs: Inputs) -> tuple[ScanCode, tuple[()]]:
         """Reading of the scan, for all particles of all runs."""
-        return self.network().observation.scan_code(inputs.ranges[:: self.beam_step], self.lidar)
+        return self.network().observation.scan_code(inputs.ranges[:: self.beam_step], self.lidar), memory
 
     def first_poses(self, key: Key) -> Array:
         """(N, 3) from the prior, or uniform over free space."""

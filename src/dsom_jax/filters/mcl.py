@@ -32,9 +32,13 @@ class MCL:
     def __post_init__(self) -> None:
         checks.share(self, "injection")
 
-    def prepare(self, inputs: Inputs) -> None:
+    def begin(self) -> tuple[()]:
+        """No memory: each scan is taken on its own."""
+        return ()
+
+    def prepare(self, memory: tuple[()], inputs: Inputs) -> tuple[None, tuple[()]]:
         """Nothing is shared between particles."""
-        return None
+        return None, memory
 
     def init(self, key: Key) -> ParticleState:
         """Uniform particles."""

@@ -10,7 +10,7 @@ import jax
 
 from dsom_jax import checks
 from dsom_jax.episode import Episode
-from dsom_jax.filters.adam import AdamMCL, AdamRecalling
+from dsom_jax.filters.adam import AdamMCL
 from dsom_jax.filters.adam_memory import AdamMemory
 from dsom_jax.filters.adam_robust import AdamRobust, RobustConfig
 from dsom_jax.filters.mcl import MCL
@@ -291,6 +291,4 @@ def make_filter(
         return MCL(world, config)
     if algorithm == "mixture_mcl":
         return MixtureMCL(world, proposal, config)
-    if isinstance(proposal, MarkovGrid):
-        return AdamRecalling(world, proposal, config, settings.t_cut)
     return AdamMCL(world, proposal, config, settings.t_cut)

@@ -217,9 +217,13 @@ class SharedProposal:
     proposal: Proposal
     config: FilterConfig = field(metadata={"static": True})
 
-    def prepare(self, inputs: Inputs) -> Any:
-        """The proposal for this scan."""
-        return self.proposal.prepare(inputs)
+    def begin(self) -> Any:
+        """The proposal's memory."""
+        return self.proposal.begin()
+
+    def prepare(self, memory: Any, inputs: Inputs) -> tuple[Any, Any]:
+        """The proposal for this scan, and its memory."""
+        return self.proposal.prepare(memory, inputs)
 
     def init(self, key: Key) -> ParticleState:
         """Uniform particles."""

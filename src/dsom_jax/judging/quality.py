@@ -20,7 +20,7 @@ from dsom_jax.nn.dsom import masked_log_softmax, one_scan
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.training.batches import Batch
 from dsom_jax.training.target import dense, make_target
-from dsom_jax.types import Array, Inputs, Proposal
+from dsom_jax.types import Array, Inputs, Proposal, prepare_alone
 
 MASS = 1.0, math.radians(15)
 """Metres and radians about the truth within which probability counts as being at the right place."""
@@ -118,7 +118,7 @@ def _compiled(function: Callable[..., Any]) -> Any:
 
 
 def _prepare(proposal: Proposal, ranges: Array) -> Any:
-    return proposal.prepare(Inputs(ranges, jnp.zeros(3), jnp.int32(0)))
+    return prepare_alone(proposal, Inputs(ranges, jnp.zeros(3), jnp.int32(0)))
 
 
 def _of_scans(proposal: Proposal, grid: OccupancyGrid, ranges: Array, poses: Array) -> Quality:

@@ -21,7 +21,7 @@ from dsom_jax.lidar import LidarConfig, scan_points
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.plotting.common import legend, panels
 from dsom_jax.pose_grid import ProbabilityMap
-from dsom_jax.types import Filter, Inputs, Proposal
+from dsom_jax.types import Filter, prepare_alone
 
 SCAN_COLOR = "#1f77b4"
 
@@ -101,10 +101,8 @@ def moment_figure(
     return map_views(views, titles)
 
 
-@jax.jit
-def _prepare(proposal: Proposal, inputs: Inputs) -> Any:
-    """What a proposal makes of one scan; compiled once for each kind of proposal."""
-    return proposal.prepare(inputs)
+_prepare = jax.jit(prepare_alone)
+"""Compiled once for each kind of proposal."""
 
 
 def _pm_of(prepared: Any) -> dict[str, Any]:

@@ -47,9 +47,13 @@ class DSOMProposal:
         """Log PM (H, W, K) of one scan as the network gives it: a pass of the scan encoder and the decoder."""
         return log_probability_map(nnx.merge(self.graph, self.weights), self.features, inputs.ranges, self.lidar)
 
-    def prepare(self, inputs: Inputs) -> pg.ProbabilityMap:
+    def begin(self) -> tuple[()]:
+        """No memory: each scan is taken on its own."""
+        return ()
+
+    def prepare(self, memory: tuple[()], inputs: Inputs) -> tuple[pg.ProbabilityMap, tuple[()]]:
         """PM of one scan, sharpened."""
-        return pg.from_log(self.pose_grid, self.sharpness * self.log_map(inputs), self.features.free)
+        return pg.from_log(self.pose_grid, self.sharpness * self.log_map(inputs), self.features.free), memory
 
     def sample(self, key: Key, prepared: pg.ProbabilityMap, n: int) -> tuple[Array, Array]:
         """``n`` poses (n, 3) from PM and their log densities."""

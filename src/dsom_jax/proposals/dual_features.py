@@ -65,14 +65,18 @@ class DualFeatures:
     lidar: LidarConfig = field(metadata={"static": True})
     config: DualFeaturesConfig = field(metadata={"static": True})
 
-    def prepare(self, inputs: Inputs) -> pg.ProbabilityMap:
+    def begin(self) -> tuple[()]:
+        """No memory: each scan is taken on its own."""
+        return ()
+
+    def prepare(self, memory: tuple[()], inputs: Inputs) -> tuple[pg.ProbabilityMap, tuple[()]]:
         """Histogram of the poses of all samples, each weighted by how alike its features are."""
         gap = (self.features - scan_features(inputs.ranges, self.lidar)) / self.config.bandwidth
         log_weight = -0.5 * (gap**2).sum(-1)
         log_weight = jnp.where(self.updates == inputs.index, -jnp.inf, log_weight)
         weight = pg.exp_or_zero(log_weight - log_weight.max())
         mass = jnp.zeros(math.prod(self.pose_grid.shape)).at[self.cells].add(weight, mode="drop")
-        return pg.probability_map(self.pose_grid, mass.reshape(self.pose_grid.shape))
+        return pg.probability_map(self.pose_grid, mass.reshape(self.pose_grid.shape)), memory
 
     def sample(self, key: Key, prepared: pg.ProbabilityMap, n: int) -> tuple[Array, Array]:
         """``n`` poses (n, 3) from PM and their log densities."""

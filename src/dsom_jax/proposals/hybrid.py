@@ -54,11 +54,15 @@ class Hybrid:
         """(H, W) bool, cells of PM with free space."""
         return self.likelihood.free
 
-    def prepare(self, inputs: Inputs) -> pg.ProbabilityMap:
+    def begin(self) -> tuple[()]:
+        """No memory: each scan is taken on its own."""
+        return ()
+
+    def prepare(self, memory: tuple[()], inputs: Inputs) -> tuple[pg.ProbabilityMap, tuple[()]]:
         """The pool of both for one scan (B,)."""
         evidence = self.config.evidence * self.likelihood.log_likelihood(inputs.ranges)
         learnt = self.config.network * self.log_network(inputs)
-        return self.likelihood.probability_map(evidence + learnt)
+        return self.likelihood.probability_map(evidence + learnt), memory
 
     def log_network(self, inputs: Inputs) -> Array:
         """(C, K) of :func:`log_network` with this pool's floor."""

@@ -76,9 +76,13 @@ class LikelihoodGrid:
     lidar: LidarConfig = field(metadata={"static": True})
     config: LikelihoodGridConfig = field(metadata={"static": True})
 
-    def prepare(self, inputs: Inputs) -> pg.ProbabilityMap:
+    def begin(self) -> tuple[()]:
+        """No memory: each scan is taken on its own."""
+        return ()
+
+    def prepare(self, memory: tuple[()], inputs: Inputs) -> tuple[pg.ProbabilityMap, tuple[()]]:
         """PM of one scan (B,): the tempered likelihood, normalised over free space."""
-        return self.probability_map(self.log_likelihood(inputs.ranges))
+        return self.probability_map(self.log_likelihood(inputs.ranges)), memory
 
     def probability_map(self, log_mass: Array) -> pg.ProbabilityMap:
         """PM of unnormalised log densities (C, K) at the free cells."""

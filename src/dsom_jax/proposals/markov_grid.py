@@ -68,12 +68,12 @@ class MarkovGrid:
         """Which of the cells (C, 1) are cells, not filling."""
         return (self.likelihood.cells < self.likelihood.free.size)[:, None]
 
-    def recall(self, belief: Array, inputs: Inputs) -> tuple[Recollection, Array]:
+    def prepare(self, memory: Array, inputs: Inputs) -> tuple[Recollection, Array]:
         """Belief (C, K) of the update before -> PMs of this one, and its belief."""
         # An increment that is not a number tells nothing, and would make all beliefs to come none: nothing moves.
         known = jnp.isfinite(inputs.odometry).all()
         still = (inputs.index == 0) | ~known
-        moved = jnp.where(still, belief, self.predict(belief, jnp.where(known, inputs.odometry, 0.0)))
+        moved = jnp.where(still, memory, self.predict(memory, jnp.where(known, inputs.odometry, 0.0)))
         prior = (1 - self.config.kidnap) * normalised(moved) + self.config.kidnap * self.begin()
         log_prior = jnp.log(prior)
         log_posterior = log_prior + self.evidence(inputs)
@@ -84,10 +84,6 @@ class MarkovGrid:
     def evidence(self, inputs: Inputs) -> Array:
         """(C, K) what one scan says: the tempered log-likelihood."""
         return self.likelihood.log_likelihood(inputs.ranges)
-
-    def prepare(self, inputs: Inputs) -> Recollection:
-        """PMs of a scan taken for the first one: without memory, whatever was seen before."""
-        return self.recall(self.begin(), inputs._replace(index=jnp.zeros_like(inputs.index)))[0]
 
     def sample(self, key: Key, prepared: Recollection, n: int) -> tuple[Array, Array]:
         """``n`` base poses (n, 3) from the belief after the scan, and their log densities."""

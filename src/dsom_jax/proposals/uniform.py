@@ -35,9 +35,13 @@ class FreeSpace:
         """() log of 1 / (free area * 2 pi), in 1 / (m^2 rad)."""
         return -jnp.log(self.cumulative[-1] * self.resolution**2 * 2 * jnp.pi)
 
-    def prepare(self, inputs: Inputs) -> None:
+    def begin(self) -> tuple[()]:
+        """No memory: each scan is taken on its own."""
+        return ()
+
+    def prepare(self, memory: tuple[()], inputs: Inputs) -> tuple[None, tuple[()]]:
         """Nothing: the scan is not looked at."""
-        return None
+        return None, memory
 
     def sample(self, key: Key, prepared: Any, n: int) -> tuple[Array, Array]:
         """``n`` poses (n, 3) in the map frame and their log densities (n,)."""

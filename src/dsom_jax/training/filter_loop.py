@@ -134,7 +134,7 @@ def follow(params: Any, graph: Any, config: FilterTrainConfig, places: CornerMap
 
     def update(state: Any, now: tuple[Key, Array, Array]) -> tuple[Any, Any]:
         inputs = Inputs(now[1], now[2], jnp.int32(0))
-        state = filter.advance(now[0], state, inputs, filter.prepare(inputs))
+        state = filter.advance(now[0], state, inputs, filter.prepare((), inputs)[0])
         return state, state
 
     keys = jax.random.split(k_steps, window.odometry.shape[0])
