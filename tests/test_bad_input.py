@@ -266,8 +266,8 @@ TRAIN = ("--config", "tiny.yaml", "--steps", "2", "--out", "out")
     ("words", "fragments"),
     [
         (("--config", "nowhere.yaml"), ["nowhere.yaml", "no such configuration"]),
-        (("--config", "room.pgm"), ["room.pgm", "not valid YAML"]),
-        (("--config", "nan.yaml"), ["nan.yaml", "TrainConfig.learning_rate = nan"]),
+        (("--config", "room.pgm"), ["room.pgm", "UTF-8"]),
+        (("--config", "nan.yaml"), ["nan.yaml", "learning_rate = nan"]),
         (("--config", "pair.yaml"), ["pair.yaml", "scan: obstacles", "expected 2 values"]),
         (("--maps", "nowhere.yaml"), ["nowhere.yaml", "no such map yaml"]),
         (("--init", "net"), ["net", "field model", "width = 2, the run's is 32"]),

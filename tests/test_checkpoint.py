@@ -75,7 +75,7 @@ def test_missing_folder(tmp_path):
     [
         ({"format": 99}, "field format"),
         ({"model": {"colour": 1}}, "field model"),
-        ({"model": {"width": 0}}, "field model: DSOMConfig.width"),
+        ({"model": {"width": 0}}, "field model: width"),
         ({"model": {"width": 4, "headings": 4}}, "weights are damaged or of another configuration|weights .* where"),
         ({"weights": "elsewhere"}, "folder of the weights is missing"),
     ],

@@ -20,7 +20,7 @@ def passes(check, *values, names="a", **options) -> bool:
     try:
         check(config, names, **options)
     except ValueError as error:
-        assert "SimpleNamespace" in str(error) and "\n" not in str(error)
+        assert "SimpleNamespace" not in str(error) and "\n" not in str(error)
         return False
     return True
 

@@ -137,7 +137,7 @@ def test_what_means_nothing_is_refused(kind, name, value):
     with pytest.raises(ValueError) as refused:
         kind(**WRONG[kind][0], **{name: value})
     message = str(refused.value)
-    assert kind.__name__ in message and name in message and "\n" not in message
+    assert name in message and "\n" not in message
     shown = [str(value), f"{value:g}"] if isinstance(value, float) else [str(value)]
     assert "must be 1" in message or any(text in message for text in shown)
 

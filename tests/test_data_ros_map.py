@@ -4,16 +4,23 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from PIL import Image
 
 from dsom_jax.data.log import Report
-from dsom_jax.data.pgm import decode_pgm, encode_pgm
-from dsom_jax.data.ros_map import MapInfo, load_ros_map, occupancy_percent, read_map_info, save_ros_map
+from dsom_jax.data.ros_map import (
+    MapInfo,
+    Picture,
+    decode_image,
+    load_ros_map,
+    occupancy_percent,
+    read_map_info,
+    save_ros_map,
+)
 from dsom_jax.errors import UserError
 from dsom_jax.occupancy import OccupancyGrid, cell_index, from_cells
 
@@ -33,10 +40,7 @@ def write(folder: Path, pixels: np.ndarray = PIXELS, **changes: str | None) -> P
     """A map in ``folder`` with fields changed, or left out where None."""
     fields = FIELDS | changes
     name = fields["image"] or "map.pgm"
-    if name.endswith(".pgm"):
-        (folder / name).write_bytes(encode_pgm(pixels))
-    else:
-        cv2.imwrite(str(folder / name), pixels)
+    Image.fromarray(pixels).save(folder / name)
     path = folder / "map.yaml"
     path.write_text("".join(f"{key}: {value}\n" for key, value in fields.items() if value is not None))
     return path
@@ -119,9 +123,9 @@ def info(mode: str, **changes: object) -> MapInfo:
     ],
 )
 def test_percentages_of_each_mode(mode: str, pixel: int, plain: int, negated: int) -> None:
-    brightness = np.array([[pixel / 255]])
-    assert occupancy_percent(brightness, None, info(mode))[0, 0] == plain
-    assert occupancy_percent(brightness, None, info(mode, negate=True))[0, 0] == negated
+    picture = Picture(np.array([[pixel]], np.uint8), 255)
+    assert occupancy_percent(picture, info(mode))[0, 0] == plain
+    assert occupancy_percent(picture, info(mode, negate=True))[0, 0] == negated
 
 
 @given(
@@ -136,7 +140,7 @@ def test_thresholds_against_exact_arithmetic(pixel: int, thresholds: tuple[int, 
     n = pixel if negate else 255 - pixel
     expected = 0 if 100 * n <= 255 * free else 100 if 100 * n >= 255 * occupied else -1
     fields = info("trinary", free_thresh=free / 100, occupied_thresh=occupied / 100, negate=negate)
-    assert occupancy_percent(np.array([[pixel / 255]]), None, fields)[0, 0] == expected
+    assert occupancy_percent(Picture(np.array([[pixel]], np.uint8), 255), fields)[0, 0] == expected
 
 
 @given(
@@ -201,9 +205,10 @@ def test_every_pgm_gives_the_same_map(tmp_path: Path, content: bytes) -> None:
     assert_same(load_ros_map(path), expected)
 
 
-def test_pgm_pixels_that_look_like_white_space_survive() -> None:
+def test_pgm_pixels_that_look_like_white_space_survive(tmp_path: Path) -> None:
     pixels = np.array([[10, 32, 13], [35, 9, 255]], np.uint8)
-    np.testing.assert_array_equal(decode_pgm(encode_pgm(pixels), Path("m")) * 255, pixels)
+    (tmp_path / "m.pgm").write_bytes(b"P5 3 2 255\n" + pixels.tobytes())
+    np.testing.assert_array_equal(decode_image(tmp_path / "m.pgm").pixels, pixels)
 
 
 def test_numbers_as_ros_writes_them(tmp_path: Path) -> None:
@@ -218,17 +223,18 @@ def test_numbers_as_ros_writes_them(tmp_path: Path) -> None:
         ({"image": None}, "field 'image' is missing"),
         ({"resolution": None}, "field 'resolution' is missing"),
         ({"negate": None}, "field 'negate' is missing"),
-        ({"resolution": "0"}, "resolution = 0.0: must be a positive"),
-        ({"resolution": "-0.05"}, "resolution = -0.05: must be a positive"),
-        ({"resolution": ".nan"}, "resolution = nan: must be a positive"),
+        ({"resolution": "0"}, "resolution = 0: must be a number of metres"),
+        ({"resolution": "-0.05"}, "resolution = -0.05: must be a number of metres"),
+        ({"resolution": ".nan"}, "resolution = nan: must be a number of metres"),
         ({"resolution": "fine"}, "resolution = 'fine': must be a number"),
         ({"origin": "[0, 0]"}, "origin = .*three numbers"),
         ({"origin": "7"}, "origin = 7: must be three numbers"),
-        ({"origin": "[0, 0, .inf]"}, "origin = .*finite"),
+        ({"origin": "[0, 0, .inf]"}, "origin = .*three numbers"),
+        ({"origin": "[0, 0, .nan]"}, "origin = .*three numbers"),
         ({"negate": "maybe"}, "negate = 'maybe': must be 0 or 1"),
         ({"free_thresh": "0.7"}, "free_thresh = 0.7, occupied_thresh = 0.65: need"),
-        ({"occupied_thresh": "1.5"}, "need 0 <= free_thresh"),
-        ({"mode": "binary"}, "mode = 'binary': choose one of trinary"),
+        ({"occupied_thresh": "1.5"}, "occupied_thresh = 1.5: must be a number from 0 to 1"),
+        ({"mode": "binary"}, "mode = 'binary': must be one of trinary"),
         ({"negate": "1", "free_thresh": "0.0"}, "negate"),
     ],
 )
@@ -250,7 +256,7 @@ def test_bad_files(tmp_path: Path) -> None:
         with pytest.raises(UserError, match=message):
             load_ros_map(path)
     path.write_bytes(b"\x89PNG\xff\xfe")
-    with pytest.raises(UserError, match="not valid YAML"):
+    with pytest.raises(UserError, match="not text in UTF-8"):
         load_ros_map(path)
 
 
@@ -258,10 +264,13 @@ def test_bad_files(tmp_path: Path) -> None:
     ("name", "content", "message"),
     [
         ("map.pgm", None, "no such map image"),
-        ("map.pgm", b"P5 what", "broken pgm header"),
-        ("map.pgm", b"P5\n3 2\n255\nabc", "fewer than 3 x 2 pixels"),
-        ("map.pgm", b"P2\n3 2\n255\n1 2 x 4 5 6", "fewer than 3 x 2 pixels"),
-        ("map.pgm", b"P5\n3 2\n0\nabcdef", "broken pgm header"),
+        ("map.pgm", b"P5 what", "not a readable image"),
+        ("map.pgm", b"P5\n3 2\n255\nabc", "truncated"),
+        ("map.pgm", b"P2\n3 2\n255\n1 2 x 4 5 6", "not a readable image"),
+        ("map.pgm", b"P2\n3 2\n255\n1 2", "not a readable image"),
+        ("map.pgm", b"P5\n3 2\n0\nabcdef", "not a readable image"),
+        ("map.pgm", b"P5\n" + 5000 * b"9" + b" 2\n255\nabcdef", "not a readable image"),
+        ("map.pgm", b"P5\n30000 30000\n255\nabc", "too large .*100,000,000 pixels"),
         ("map.png", b"", "not a readable image"),
         ("map.png", b"no image at all", "not a readable image"),
     ],

@@ -88,7 +88,7 @@ def test_public_names_exist():
 
 
 def test_import_is_light():
-    code = "import dsom_jax, sys; assert 'jax' not in sys.modules and 'cv2' not in sys.modules"
+    code = "import dsom_jax, sys; assert 'jax' not in sys.modules and 'PIL' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 

@@ -167,7 +167,7 @@ def test_a_suite_of_ones_own(tmp_path: Path) -> None:
         ("[[episodes]]\nmap = 'office.yaml'\nresolution = 0", "resolution = 0"),
         ("[[episodes]]\nmap = 'office.yaml'\nkidnap_distance = 90", "episodes\\[0\\].*kidnap_distance"),
         ("[lidar]\nbeam = 3\n[[episodes]]\nworld = 1", "lidar has an unknown field 'beam'"),
-        ("[lidar]\nbeams = 0\n[[episodes]]\nworld = 1", "LidarConfig.beams"),
+        ("[lidar]\nbeams = 0\n[[episodes]]\nworld = 1", "lidar: beams"),
         ("lidar = 3\n[[episodes]]\nworld = 1", "table \\[lidar\\]"),
     ],
 )

@@ -18,7 +18,7 @@ import yaml
 
 from dsom_jax import checkpoint, report
 from dsom_jax.cli import parse
-from dsom_jax.data.files import read_yaml
+from dsom_jax.data.documents import read_yaml
 from dsom_jax.errors import UserError, run_cli
 
 HERE = Path(__file__).resolve().parent

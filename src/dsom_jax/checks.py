@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from numbers import Real
 from typing import Any
 
+from dsom_jax.errors import shown
+
 
 def within(config: Any, names: str, least: float, most: float, fix: str, *, excluding: str = "") -> None:
     """ValueError unless every field of ``names`` (space-separated) is a number from ``least`` to ``most``.
@@ -81,13 +83,15 @@ def sum_to_one(config: Any, names: str) -> None:
     """ValueError unless the fields sum to one."""
     total = sum(getattr(config, name) for name in names.split())
     if abs(total - 1) > 1e-6:
-        raise ValueError(f"{type(config).__name__}: {' + '.join(names.split())} = {total:g}: must be 1")
+        raise ValueError(f"{' + '.join(names.split())} = {total:g}: must be 1")
 
 
 def message(config: Any, name: str, fix: str) -> str:
-    """Class, field and value, and what to do."""
-    return f"{type(config).__name__}.{name} = {getattr(config, name)!r}: {fix}"
+    """Field and value, and what to do; whoever reads a file puts its name before it."""
+    return f"{name} = {shown(getattr(config, name))}: {fix}"
 
 
 def _number(value: Any) -> bool:
-    return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
+    if isinstance(value, int):  # perhaps too large for a float
+        return not isinstance(value, bool)
+    return isinstance(value, Real) and math.isfinite(value)

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 from dsom_jax import checkpoint
 from dsom_jax.atomic import write_atomic
-from dsom_jax.data.files import read_yaml
+from dsom_jax.data.documents import read_yaml
 from dsom_jax.errors import UserError
 from dsom_jax.training.filter_loop import averaged_filter_model
 from dsom_jax.training.loop import averaged_model, late_start

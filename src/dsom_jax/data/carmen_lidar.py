@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from dsom_jax.data.files import read_yaml
+from dsom_jax.data.documents import read_yaml
 from dsom_jax.errors import UserError
 from dsom_jax.lidar import LidarConfig
 

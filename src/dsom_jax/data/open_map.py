@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from dsom_jax.data.documents import read_yaml
 from dsom_jax.data.dxf import Drawing, load_drawing
-from dsom_jax.data.files import read_yaml
 from dsom_jax.data.log import Report
 from dsom_jax.data.ros_map import load_ros_map
 from dsom_jax.errors import UserError

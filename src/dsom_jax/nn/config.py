@@ -49,9 +49,9 @@ class DSOMConfig:
             raise ValueError(checks.message(self, "headings", "give an even number"))
         checks.choice(self, "encoder", ("polar", "paper"))
         if self.encoder == "paper" and self.scan_size not in (64, 128):
-            raise ValueError(f"DSOMConfig.scan_size = {self.scan_size}: 64 or 128, so that 4 x 4 cells reach the MLP")
+            raise ValueError(f"scan_size = {self.scan_size}: 64 or 128, so that 4 x 4 cells reach the MLP")
         if self.panorama and self.encoder != "polar":
-            raise ValueError("DSOMConfig.panorama needs encoder polar")
+            raise ValueError("panorama needs encoder polar")
         checks.positive(self, "resolution range_max fov_min reach_min")
 
     @property

@@ -12,8 +12,8 @@ import yaml
 
 from dsom_jax.atomic import write_atomic
 from dsom_jax.data import RawLog, load_log
+from dsom_jax.data.documents import read_yaml
 from dsom_jax.data.dxf import UNITS
-from dsom_jax.data.files import read_yaml
 from dsom_jax.data.log import limited
 from dsom_jax.errors import UserError
 from dsom_jax.filters.methods import METHODS, network_of

@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-from dsom_jax.data.files import read_yaml
+from dsom_jax.data.documents import read_yaml
 from dsom_jax.errors import UserError
 from dsom_jax.filters.methods import DRAWN, REAL, Settings
 from dsom_jax.motion import OdometryMotion, OmniMotion

@@ -63,7 +63,7 @@ class DriveConfig:
 
     def __post_init__(self) -> None:
         if not self.updates or min(self.updates) < 2:
-            raise ValueError(f"DriveConfig.updates = {self.updates}: each phase needs at least 2 updates")
+            raise ValueError(f"updates = {self.updates}: each phase needs at least 2 updates")
         checks.positive(self, "update_min_d update_min_a")
         checks.count(self, "obstacles removed", 0)
         checks.not_negative(self, "kidnap_distance near margin")

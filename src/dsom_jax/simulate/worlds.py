@@ -70,7 +70,7 @@ class WorldConfig:
         if not (len(levels) == 4 and all(p >= 0 for p in levels) and abs(sum(levels) - 1) < 1e-6):
             raise ValueError(checks.message(self, "corridors", "give four probabilities that sum to one"))
         if self.room_size[0] < 4 * self.resolution or self.corridor_width[0] < 4 * self.resolution:
-            raise ValueError("WorldConfig: rooms and corridors need at least 4 cells; use finer cells")
+            raise ValueError("rooms and corridors need at least 4 cells; use finer cells")
 
     @property
     def depth(self) -> int:

@@ -100,7 +100,7 @@ class TrainConfig:
         checks.count(self, "warmup seed", 0)
         checks.within(self, "seed", 0, 2**31 - 1, "give less than 2^31")
         if self.model.fov_min < self.scan.fov_min - 1e-6 or self.model.reach_min < self.scan.reach_min - 1e-6:
-            raise ValueError("TrainConfig: model.fov_min and model.reach_min promise scans that scan.* does not draw")
+            raise ValueError("model.fov_min and model.reach_min promise scans that scan.* does not draw")
 
 
 class TrainState(NamedTuple):
