@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import csv
 import json
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -62,8 +64,10 @@ def test_with_reference(call, room, tmp_path):
     assert low < 1 and high == 1
     assert [segment["on_map"] for segment in summary["by_segment"]] == [1, 1]
     assert "converged 100.0%" in printed and {p.name for p in (tmp_path / "out").iterdir()} == {
-        "summary.json", "estimate.tum",
+        "summary.json", "estimate.tum", "answers.csv", "report.html", "trajectory.png",
     }  # fmt: skip
+    check_answers(tmp_path / "out")
+    check_page(tmp_path / "out", summary)
     trajectory = file_interface.read_tum_trajectory_file(tmp_path / "out" / "estimate.tum")
     truth = file_interface.read_tum_trajectory_file(room.reference)
     valid, details = trajectory.check()
@@ -74,6 +78,32 @@ def test_with_reference(call, room, tmp_path):
     off = np.linalg.norm(trajectory.positions_xyz - truth.positions_xyz[expected], axis=-1)
     # Only the first answers, after a scan or two, may be wrong.
     assert np.median(off) < 0.1 and (off.reshape(2, 20)[:, 5:] < 0.5).all()
+
+
+def check_answers(out):
+    """answers.csv says what estimate.tum says, and how sure run 0 was."""
+    with (out / "answers.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    said = file_interface.read_tum_trajectory_file(out / "estimate.tum")
+    for column, expected in zip(("stamp", "x", "y"), (said.timestamps, *said.positions_xyz.T[:2]), strict=True):
+        np.testing.assert_allclose([float(row[column]) for row in rows], expected, atol=2e-4)
+    later = [row for n, row in enumerate(rows) if n % 20 >= 5]
+    assert all(row["verdict"] == "localized" and row["hypotheses"] == "1" for row in later)
+    assert all(float(row["p_lost"]) < 0.05 for row in later)
+    # 60 particles around a pose that 32 exact beams pin down to some centimetres.
+    assert all(0 < float(row[sd]) < 0.3 for row in later for sd in ("sd_x", "sd_y", "sd_theta"))
+
+
+def check_page(out, summary):
+    """report.html has the drives of run 0, and its large numbers are those of summary.json."""
+    html = (out / "report.html").read_text()
+    tiles = dict(re.findall(r'data-key="(\w+)" data-value="([^"]+)"', html))
+    assert {"converged", "e_pos_m_median", "false_confident"} <= set(tiles)
+    assert all(float(value) == summary[key] for key, value in tiles.items())
+    data = json.loads(re.search(r'id="story">(.*?)</script>', html).group(1))
+    assert [drive["name"] for drive in data["drives"]] == ["segment 1", "segment 2"]
+    assert data["drives"][0]["particles"]["count"] == 60
+    assert (out / "trajectory.png").read_bytes()[:4] == b"\x89PNG"
 
 
 def test_same_seed_same_summary_and_estimate(call, tmp_path):

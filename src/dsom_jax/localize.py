@@ -24,6 +24,7 @@ from dsom_jax.lidar import LidarConfig
 from dsom_jax.montecarlo import run, run_keys
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.types import Filter
+from dsom_jax.view.localized import write_view
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,7 @@ class Args:
     log: Path
     """CARMEN (.log, .clf, .gz), rosbag1, rosbag2, mcap, or Rawseeds (*-SICK_FRONT.csv, or its folder)."""
     out: Path
-    """Folder for summary.json and estimate.tum."""
+    """Folder for report.html, trajectory.png, summary.json, answers.csv and estimate.tum."""
     reference: Path | None = None
     """TUM trajectory of the base in the map frame; default: the log's own, where it has one."""
     scan_topic: str | None = None
@@ -87,8 +88,9 @@ def main() -> None:
     grid = load_map(args.map, left_out)
     log = load_log(args.log, reference=args.reference, scan_topic=args.scan_topic, odom_topic=args.odom_topic)
     log = limited(log, args.laser_max_range)
-    for file, report_of in ((args.map, left_out), (args.log, log.report)):
-        print("".join(f"{file.name}: {line}\n" for line in report_of.lines()), end="")
+    reports = ((args.map, left_out), (args.log, log.report))
+    notes = [f"{file.name}: {line}" for file, report_of in reports for line in report_of.lines()]
+    print("".join(f"{note}\n" for note in notes), end="")
     drives = cut(log, args)
     network = load_network(args, log.lidar)
     folder = report.output_folder(args.out)
@@ -98,6 +100,7 @@ def main() -> None:
     summary = summarize(outcomes, grid, args)
     report.write_json(folder / "summary.json", summary)
     save_estimate(folder / "estimate.tum", outcomes)
+    write_view(folder, outcomes, grid, log.lidar, summary, notes, args)
     print_summary(summary)
 
 
@@ -201,11 +204,12 @@ def localize(filter: Filter, drives: Any, runs: int, seed: int) -> list[Outcome]
     for number, drive in enumerate(drives):
         keys = run_keys(seed, number, runs)
         start = time.perf_counter()
-        result = jax.block_until_ready(run(filter, drive.episode, keys))
+        keep = range(len(drive.stamps))
+        result = jax.block_until_ready(run(filter, drive.episode, keys, keep))
         outcomes.append(Outcome(drive, result, time.perf_counter() - start))
     if len(outcomes) == 1:
         start = time.perf_counter()
-        jax.block_until_ready(run(filter, outcomes[0].drive.episode, run_keys(seed, 0, runs)))
+        jax.block_until_ready(run(filter, outcomes[0].drive.episode, run_keys(seed, 0, runs), keep))
         return [outcomes[0]._replace(seconds=time.perf_counter() - start)]
     return outcomes
 

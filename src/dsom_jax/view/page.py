@@ -68,7 +68,9 @@ def shown(value: float | None, kind: str) -> str:
 def _player(story: Story) -> str:
     if not (story.drives or story.overlay):
         return ""
-    html = Template(_part("player.html")).substitute(label="The drive" if story.drives else "The map")
+    html = Template(_part("player.html")).substitute(
+        label="The drive" if story.drives else "The map", caption=escape(story.caption)
+    )
     if story.overlay is None:
         return html
     layer, key = story.overlay, "<p class='overlay-key'><span>{low}</span><i></i><span>{high}</span><b>{label}</b></p>"

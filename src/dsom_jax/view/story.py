@@ -142,6 +142,7 @@ class Story:
         tables: (caption, column heads, rows of text).
         findings, settings: what to know, and what was set.
         overlay, lookalikes: for pages about a map.
+        caption: what exactly is shown of the drives.
     """
 
     title: str
@@ -155,6 +156,7 @@ class Story:
     settings: dict[str, Any] = field(default_factory=dict)
     overlay: Field | None = None
     lookalikes: tuple[Lookalike, ...] = ()
+    caption: str = ""
 
 
 class Moment(NamedTuple):

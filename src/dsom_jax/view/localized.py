@@ -1,0 +1,124 @@
+"""The page of ``localize``: what its runs came to, and run 0 of every drive to look at."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dsom_jax.judging import Outcome, estimates
+from dsom_jax.lidar import LidarConfig
+from dsom_jax.occupancy import OccupancyGrid
+from dsom_jax.plotting import save
+from dsom_jax.view.answers import Answers, answers, write_answers
+from dsom_jax.view.page import shown, write_page
+from dsom_jax.view.picture import trajectory_figure
+from dsom_jax.view.story import DriveStory, Finding, Plan, Story
+
+JUDGED = (
+    ("converged", "of all starts found", "percent"),
+    ("metres_median", "driven until found, median", "metres"),
+    ("e_pos_m_median", "off at the end, median", "metres"),
+    ("retention", "of the later updates still right", "percent"),
+    ("false_confident", "of the updates sure and wrong", "percent"),
+)
+UNJUDGED = (("confident", "of the updates sure of an answer", "percent"), ("updates", "updates", "count"))
+
+
+def write_view(
+    folder: Path,
+    outcomes: list[Outcome],
+    grid: OccupancyGrid,
+    lidar: LidarConfig,
+    summary: dict[str, Any],
+    notes: Sequence[str],
+    settings: Any,
+) -> None:
+    """``answers.csv``, ``trajectory.png`` and ``report.html``; ``settings`` are the arguments of the command line.
+
+    The outcomes keep the states of all updates (``montecarlo.run(..., keep=range(T))``).
+    """
+    said = [told(outcome, settings.method) for outcome in outcomes]
+    story = tell(outcomes, said, grid, lidar, summary, notes, settings)
+    write_answers(folder / "answers.csv", said)
+    save(trajectory_figure(story.plan, story.drives[0]), folder / "trajectory.png")
+    write_page(folder / "report.html", story)
+
+
+def told(outcome: Outcome, method: str) -> Answers:
+    """Answers of run 0 of a drive."""
+    return answers(outcome.drive.stamps, estimates(outcome, method), outcome.result.info, outcome.result.kept)
+
+
+def tell(
+    outcomes: list[Outcome],
+    said: list[Answers],
+    grid: OccupancyGrid,
+    lidar: LidarConfig,
+    summary: dict[str, Any],
+    notes: Sequence[str],
+    settings: Any,
+) -> Story:
+    """The story of all drives."""
+    place, log = Path(summary["map"]).name, Path(summary["log"]).name
+    drives = tuple(
+        _drive(f"segment {n}", outcome, a) for n, (outcome, a) in enumerate(zip(outcomes, said, strict=True), 1)
+    )
+    judged = "converged" in summary
+    return Story(
+        f"Finding the robot in {Path(place).stem}",
+        headline(summary),
+        plan_of(grid, lidar, f"{place} · {log}"),
+        drives,
+        summary,
+        JUDGED if judged else UNJUDGED,
+        (_segments(summary),) if judged else (),
+        tuple(Finding(note) for note in notes),
+        dataclasses.asdict(settings),
+        caption=f"Run 1 of {summary['runs']} of each segment.",
+    )
+
+
+def plan_of(grid: OccupancyGrid, lidar: LidarConfig, name: str) -> Plan:
+    """The map and the lidar as a page needs them."""
+    arrays = (np.asarray(part) for part in (grid.occupied, grid.free, grid.origin))
+    return Plan(*arrays, grid.resolution, lidar.angles(), lidar.mount[:2], name)
+
+
+def headline(summary: dict[str, Any]) -> str:
+    """What came out, in words."""
+    if "converged" not in summary:
+        sure = f"The filter was sure of its answer at {shown(summary['confident'], 'percent')} of"
+        return f"{sure} {summary['updates']} updates. There is no reference to judge it by."
+    starts = summary["experiments"]
+    text = f"Started anywhere, the robot was found in {shown(summary['converged'], 'percent')} of {starts} runs"
+    if summary["metres_median"] == summary["metres_median"]:  # none was found: not a number
+        text += f", after {shown(summary['metres_median'], 'metres')} of driving (median)"
+    if "kidnap" in summary:
+        text += f". Carried away unnoticed, it was found again in {shown(summary['kidnap']['converged'], 'percent')}"
+    fooled = summary["false_confident"]
+    if not fooled:
+        return f"{text}. It was never sure and wrong."
+    return f"{text}. At {shown(fooled, 'percent')} of the updates it was sure and wrong."
+
+
+def _drive(name: str, outcome: Outcome, said: Answers) -> DriveStory:
+    episode = outcome.drive.episode
+    return DriveStory(
+        name, said.stamps, said.poses, said.p_lost, said.verdicts, np.asarray(episode.poses, float),
+        np.asarray(episode.kidnapped), np.asarray(episode.ranges), said.particles, said.weights, said.hypotheses,
+    )  # fmt: skip
+
+
+def _segments(summary: dict[str, Any]) -> tuple[str, tuple[str, ...], tuple[tuple[str, ...], ...]]:
+    """Table of the segments."""
+    rows = tuple(
+        (str(n), f"{part['start_stamp']:.1f} s", shown(part["on_map"], "percent"), shown(part["converged"], "percent"),
+         shown(part["strict_success"], "percent"), shown(part["e_pos_m_median"], "metres"))
+        for n, part in enumerate(summary["by_segment"], 1)
+    )  # fmt: skip
+    heads = ("segment", "starts at", "on the map", "found", "within 0.5 m at the end", "off at the end, median")
+    return "Segments", heads, rows
