@@ -11,7 +11,7 @@ import numpy as np
 
 from dsom_jax.atomic import write_atomic
 from dsom_jax.filters.common import CLUSTER_ANGLE, CLUSTER_RADIUS
-from dsom_jax.metrics import CONFIDENT
+from dsom_jax.judging.metrics import CONFIDENT
 from dsom_jax.view.story import VERDICTS, Hypotheses
 
 PLACES, HELD, SMALLEST = 6, 0.99, 0.005

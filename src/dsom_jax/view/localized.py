@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from dsom_jax.judging import Outcome, estimates
+from dsom_jax.judging.scores import Outcome, estimates
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.plotting import save
@@ -84,8 +84,8 @@ def tell(
 
 def plan_of(grid: OccupancyGrid, lidar: LidarConfig, name: str) -> Plan:
     """The map and the lidar as a page needs them."""
-    arrays = (np.asarray(part) for part in (grid.occupied, grid.free, grid.origin))
-    return Plan(*arrays, grid.resolution, lidar.angles(), lidar.mount[:2], name)
+    occupied, free, origin = (np.asarray(part) for part in (grid.occupied, grid.free, grid.origin))
+    return Plan(occupied, free, origin, grid.resolution, lidar.angles(), lidar.mount[:2], name)
 
 
 def headline(summary: dict[str, Any]) -> str:
