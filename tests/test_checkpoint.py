@@ -51,6 +51,15 @@ def test_round_trip(saved):
     assert record["seed"] == 3 and record["metrics"]["top1"] == 0.5 and "jax" in record["packages"]
 
 
+def test_half_precision_is_half_the_size_and_read_as_single(saved, tmp_path):
+    checkpoint.save(tmp_path, create(CONFIG, seed=3), half=True)
+    loaded = leaves(checkpoint.load(tmp_path))
+    for ours, theirs in zip(loaded, leaves(create(CONFIG, seed=3)), strict=True):
+        assert ours.dtype == jnp.float32
+        # Eleven bits of mantissa; below 2^-14 steps are 2^-24.
+        np.testing.assert_allclose(ours, theirs, rtol=2**-11, atol=2**-25)
+
+
 def test_saving_again_replaces_and_leaves_one_folder(copy):
     checkpoint.save(copy, create(CONFIG, seed=4), tag="weights-2")
     assert [p.name for p in copy.glob("weights*")] == ["weights-2"]

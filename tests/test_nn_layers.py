@@ -6,8 +6,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax import nnx
 
-from dsom_jax.nn.layers import EPSILON, BatchNormELU, batch_norm_elu, channel_sum, conv3x3
+from dsom_jax.nn import layers
+from dsom_jax.nn.layers import (
+    EPSILON,
+    BatchNormELU,
+    CircularBlock,
+    Stack,
+    batch_norm_elu,
+    channel_sum,
+    conv3x3,
+    own_gradients,
+    product,
+)
 from dsom_jax.nn.similarity import cosine_similarity
 
 
@@ -39,6 +51,38 @@ def test_batch_norm_elu_and_its_gradients_equal_jax():
     np.testing.assert_allclose(out, expected, rtol=1e-4, atol=1e-4)
     for ours, theirs in zip(pullback(g), expected_pullback(g), strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=2e-3, atol=2e-3)
+
+
+def test_own_gradients_are_for_cpus_alone(monkeypatch):
+    assert own_gradients() == (jax.default_backend() == "cpu")
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert not own_gradients()
+    monkeypatch.setattr(layers, "OWN_GRADIENTS", True)
+    assert own_gradients()
+
+
+def test_both_sides_of_the_switch_give_the_same_network_and_gradients(monkeypatch):
+    """Float32 sums of up to 3 x 3 x 5 x 128 products: rounding of some 1e-5 of the largest entry."""
+    rng = np.random.default_rng(0)
+    image, circle = (jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in ((2, 8, 8, 3), (4, 8, 5)))
+    graphs = [nnx.split(make, nnx.Param, ...) for make in (Stack(3, [5, 4], rng), CircularBlock(5, 6, rng))]
+
+    def loss(params, graph, rest, x):
+        model = nnx.merge(graph, params, rest)
+        out = jnp.sin(model(x)).sum()
+        return out, nnx.as_pure(nnx.state(model, nnx.BatchStat))
+
+    found = {}
+    for own in (True, False):
+        monkeypatch.setattr(layers, "OWN_GRADIENTS", own)
+        found[own] = [
+            jax.value_and_grad(loss, has_aux=True)(nnx.as_pure(params), graph, nnx.as_pure(rest), x)
+            for (graph, params, rest), x in zip(graphs, (image, circle), strict=True)
+        ]
+    for one, other in zip(*(jax.tree.leaves(found[own]) for own in (True, False)), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-4 * max(1.0, float(jnp.abs(one).max())))
+    x, kernel = image[..., 0], jnp.ones((8, 2))
+    np.testing.assert_allclose(product(x, kernel), x @ kernel, rtol=1e-6)
 
 
 @pytest.mark.parametrize("shape", [(3,), (7, 3), (300, 2), (16, 32, 16, 4)])

@@ -66,7 +66,7 @@ def test_a_run_resumed_before_its_length_is_known_takes_the_steps_that_are_asked
 def test_a_checkpoint_is_not_written_over_in_place(tmp_path, monkeypatch):
     tags = []
     monkeypatch.setattr(checkpoint, "save_state", lambda path, state: path.mkdir(exist_ok=True))
-    monkeypatch.setattr(checkpoint, "save", lambda out, model, provenance, tag: tags.append(tag))
+    monkeypatch.setattr(checkpoint, "write", lambda out, model, provenance, tag: tags.append(tag))
     monkeypatch.setattr(Run, "model", lambda self, state: None)
     run = Run(tmp_path, TrainConfig(), (), 6)
     run.save(SimpleNamespace(step=5), {})

@@ -11,16 +11,19 @@ import json
 import logging
 import shutil
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, fields
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeVar
 
 import jax
+import jax.numpy as jnp
 import orbax.checkpoint.experimental.v1 as ocp
 from flax import nnx
 
-from dsom_jax.atomic import write_atomic
+from dsom_jax.atomic import sync_tree, write_atomic
 from dsom_jax.errors import UserError
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.nn import KINDS, evaluation_view, kind_of
@@ -28,7 +31,11 @@ from dsom_jax.training.options import override
 
 T = TypeVar("T")
 PROVENANCE = "provenance.json"
+DRAFT = ".orbax-checkpoint-tmp"
+"""What orbax adds to the name of a folder until it is complete."""
 FORMAT = 1
+JSON_BYTES = 2**24
+"""No record of ours comes near; a larger file is something else."""
 SHIPPED = Path(__file__).parents[2] / "checkpoints" / "dsom"
 """The network in the repository that this package runs from; not there once it is installed elsewhere."""
 
@@ -39,27 +46,41 @@ def shipped(kind: str = "dsom") -> Path | None:
     return folder if (folder / PROVENANCE).is_file() else None
 
 
-def save(directory: str | Path, model: Any, provenance: dict[str, Any] | None = None, tag: str = "weights") -> None:
-    """Write ``model`` as a checkpoint, replacing an older one in the same folder in one atomic step.
+def save(directory: str | Path, model: Any, provenance: dict[str, Any] | None = None, **how: Any) -> None:
+    """:func:`write` a checkpoint and remove the weights of the one that it replaces; nothing else is touched."""
+    replaced = tag_of(directory)
+    if replaced not in (None, write(directory, model, provenance, **how)):
+        remove_tree(Path(directory) / str(replaced))
+
+
+def write(
+    directory: str | Path,
+    model: Any,
+    provenance: dict[str, Any] | None = None,
+    tag: str = "weights",
+    half: bool = False,
+) -> str:
+    """Write ``model`` as a checkpoint; in one atomic step it takes the place of an older one, whose weights stay.
 
     Args:
         directory: the checkpoint's folder, made if it does not exist.
         model: a network of :data:`dsom_jax.nn.KINDS`; of a DSOM the training mode or the evaluation view.
         provenance: JSON-able facts to keep: seed, commit, data, metrics.
         tag: name of the folder of the weights; must differ from that of the checkpoint replaced.
+        half: store the weights in half precision; statistics stay as they are, and both are read as float32.
+
+    Returns ``tag``.
     """
     directory = Path(directory).absolute()
     what = {"kind": kind_of(model.config), "model": asdict(model.config)}
     record = {"format": FORMAT, **what, "weights": tag, "packages": packages()}
     try:
         directory.mkdir(parents=True, exist_ok=True)
-        _save_tree(directory / tag, _weights(model))
-        write_json(directory / PROVENANCE, {**record, **(provenance or {})})
     except OSError as error:
         raise UserError(f"{directory}: cannot write the checkpoint ({error.strerror}); give another folder") from error
-    for old in directory.glob("weights*"):
-        if old.name != tag:
-            shutil.rmtree(old, ignore_errors=True)
+    _save_tree(directory / tag, _halved(_weights(model)) if half else _weights(model))
+    write_json(directory / PROVENANCE, {**record, **(provenance or {})})
+    return tag
 
 
 def load(
@@ -88,10 +109,7 @@ def load_provenance(directory: str | Path, kind: str = "dsom") -> dict[str, Any]
     path = Path(directory) / PROVENANCE
     if not path.is_file():
         raise UserError(f"{path}: no such file; give a folder written by `python -m {KINDS[kind].command} --out`")
-    try:
-        record = json.loads(path.read_text())
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise UserError(f"{path}: not JSON ({error}); restore the file or train again") from error
+    record = read_json(path, "restore the file or train again")
     if not isinstance(record, dict) or record.get("format") != FORMAT:
         raise UserError(f"{path}: field format is not {FORMAT}; this is not a checkpoint of this version, train again")
     for name in ("model", "weights"):
@@ -113,10 +131,13 @@ def digest(directory: str | Path) -> str:
 
 def tag_of(directory: str | Path) -> str | None:
     """Name of the folder of the weights that the checkpoint in ``directory`` consists of; None without a checkpoint."""
+    path = Path(directory) / PROVENANCE
     try:
-        return str(json.loads((Path(directory) / PROVENANCE).read_text())["weights"])
-    except (OSError, ValueError, KeyError, TypeError):
+        tag = read_json(path, "")["weights"] if path.is_file() else None
+    except (UserError, KeyError, TypeError, IndexError):
         return None
+    # Weights lie in the folder itself: a name that leads elsewhere is none.
+    return tag if isinstance(tag, str) and tag == Path(tag).name and tag not in ("", ".", "..") else None
 
 
 def save_state(directory: str | Path, state: Any) -> None:
@@ -134,6 +155,26 @@ def write_json(path: Path, record: Any) -> None:
     write_atomic(path, (json.dumps(record, indent=2) + "\n").encode())
 
 
+def read_json(path: Path, advice: str) -> Any:
+    """The record in a JSON file; UserError, ending in ``advice``, for one that cannot be read or is none."""
+    try:
+        if path.stat().st_size > JSON_BYTES:
+            raise UserError(f"{path}: has more than {JSON_BYTES // 2**20} MiB; {advice}")
+        return json.loads(path.read_bytes())
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror}); {advice}") from error
+    except RecursionError:
+        raise UserError(f"{path}: not JSON that can be read (nested too deeply); {advice}") from None
+    except ValueError as error:  # not JSON, not UTF-8, or a number of too many digits
+        raise UserError(f"{path}: not JSON ({str(error)[:120]}); {advice}") from None
+
+
+def remove_tree(folder: Path) -> None:
+    """Remove a folder of weights or of a state; a link in its place is left alone."""
+    if folder.is_dir() and not folder.is_symlink():
+        shutil.rmtree(folder, ignore_errors=True)
+
+
 def packages() -> dict[str, str]:
     """Versions of what the numbers depend on."""
     return {name: version(name) for name in ("jax", "flax", "optax", "orbax-checkpoint", "numpy")}
@@ -145,27 +186,48 @@ def _weights(model: Any) -> dict[str, Any]:
     return {"params": nnx.to_pure_dict(params), "stats": nnx.to_pure_dict(stats)}
 
 
+def _halved(weights: dict[str, Any]) -> dict[str, Any]:
+    return {**weights, "params": jax.tree.map(lambda x: x.astype(jnp.float16), weights["params"])}
+
+
 def _save_tree(path: Path, tree: Any) -> None:
-    """Orbax writes under a temporary name and renames, which makes it atomic."""
-    ocp.save(path, tree, overwrite=True)
+    """Orbax writes under a temporary name and renames, which makes it atomic; it is on the disk when this returns."""
+    with _quiet():
+        try:
+            ocp.save(path, tree, overwrite=True)
+            sync_tree(path)
+        except Exception as error:  # orbax and tensorstore raise many kinds
+            remove_tree(path.with_name(path.name + DRAFT))  # of which a full disk has most need
+            reason = "the disk is full" if "no space left" in str(error).lower() else _first_line(error)
+            raise UserError(
+                f"{path}: cannot be written ({reason}); what was saved before is intact; free some space, "
+                "or give another folder"
+            ) from None
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Without absl's log, where orbax says what it also raises."""
+    chatter = logging.getLogger("absl")
+    level = chatter.level
+    chatter.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        chatter.setLevel(level)
 
 
 def _load_tree(path: Path, like: T) -> T:
     if not path.is_dir():
         raise UserError(f"{path}: the folder of the weights is missing; copy the whole checkpoint or train again")
     abstract = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), like)
-    chatter = logging.getLogger("absl")  # where orbax logs what it also raises
-    level = chatter.level
-    chatter.setLevel(logging.CRITICAL)
-    try:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message="Sharding info not provided")  # one device or many: as it comes
+    with _quiet(), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Sharding info not provided")  # one device or many: as it comes
+        try:
             tree = ocp.load(path, abstract)
-    except Exception as error:  # orbax and tensorstore raise many kinds; all mean that the files do not fit
-        reason = f"weights are damaged or of another configuration ({_first_line(error)})"
-        raise UserError(f"{path}: {reason}; train again") from error
-    finally:
-        chatter.setLevel(level)
+        except Exception as error:  # orbax and tensorstore raise many kinds; all mean that the files do not fit
+            reason = f"weights are damaged or of another configuration ({_first_line(error)})"
+            raise UserError(f"{path}: {reason}; train again") from error
     for new, old in zip(jax.tree.leaves(tree), jax.tree.leaves(like), strict=True):
         if new.shape != old.shape:
             raise UserError(f"{path}: weights {new.shape} where the configuration has {old.shape}; train again")

@@ -49,7 +49,7 @@ def run_cli(main: Callable[[], None]) -> None:
     except UserError as error:
         refuse(str(error))
     except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
+        print("interrupted; files that were written before are complete", file=sys.stderr)
         raise SystemExit(130) from None
     except BrokenPipeError:
         sys.stdout = None  # or Python would complain once more when it flushes at the end

@@ -1,14 +1,22 @@
-"""The folder of a training run: what it keeps so that it can be killed at any moment and resumed."""
+"""The folder of a training run: what it keeps so that it can be killed at any moment and resumed.
+
+One process at a time writes in it (``.lock``), and removes nothing but what ``owner.json`` says that the run has
+written. Whatever else lies there stays. States and weights are on the disk before the older ones are removed.
+"""
 
 from __future__ import annotations
 
 import json
-import shutil
+import os
+import platform
 import subprocess
-from collections.abc import Callable
+import uuid
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
+
+from filelock import FileLock, Timeout
 
 from dsom_jax import checkpoint
 from dsom_jax.atomic import write_atomic
@@ -18,13 +26,72 @@ from dsom_jax.training.filter_loop import averaged_filter_model
 from dsom_jax.training.loop import averaged_model, late_start
 
 R = TypeVar("R", bound="Run")
+S = TypeVar("S")
+LOCK, OWNER, RUN = ".lock", "owner.json", "run.json"
+
+
+class Claim:
+    """The right of this process to write in a run folder, and what was written there by it and those before it.
+
+    UserError if another process holds the folder, or if it cannot be written.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.name = folder, uuid.uuid4().hex
+        self.lock = FileLock(folder / LOCK, is_singleton=True)
+        try:
+            self.lock.acquire(timeout=0)
+        except Timeout:
+            raise UserError(
+                f"{folder}: another training (process {self.read().get('process', 'unknown')}) writes there; "
+                "wait for it, or give another --out"
+            ) from None
+        except OSError as error:
+            raise UserError(f"{folder}: cannot write ({error.strerror}); give another --out") from error
+        wrote = self.read().get("wrote")
+        # A run of an earlier version has no list: its states, and the weights of its checkpoint.
+        old = [path.name for path in states_in(folder)] + [tag for tag in [checkpoint.tag_of(folder)] if tag]
+        self.wrote: set[str] = set(wrote if isinstance(wrote, list) else old if (folder / RUN).is_file() else [])
+        self.write()
+
+    def read(self) -> dict[str, Any]:
+        """What ``owner.json`` holds; nothing where there is none."""
+        path = self.folder / OWNER
+        record = checkpoint.read_json(path, "remove it if nothing trains there") if path.is_file() else {}
+        return record if isinstance(record, dict) else {}
+
+    def write(self) -> None:
+        """Write ``owner.json``."""
+        who = {"process": os.getpid(), "host": platform.node(), "claim": self.name}
+        checkpoint.write_json(self.folder / OWNER, {**who, "wrote": sorted(self.wrote)})
+
+    def check(self) -> None:
+        """UserError if the folder is no longer that of this process: nothing may be written or removed there."""
+        if self.read().get("claim") != self.name:
+            raise UserError(f"{self.folder}: was taken by another training (see {OWNER}); nothing was written there")
+
+    def announce(self, *names: str) -> None:
+        """Note folders that are about to be written; what a killed process has left of them is removed."""
+        self.wrote |= set(names)
+        self.write()
+        for name in names:
+            checkpoint.remove_tree(self.folder / (name + checkpoint.DRAFT))
+
+    def discard(self, names: Iterable[str]) -> None:
+        """Remove those of ``names`` that the run has written."""
+        for name in self.wrote.intersection(names):
+            checkpoint.remove_tree(self.folder / name)
+            checkpoint.remove_tree(self.folder / (name + checkpoint.DRAFT))
+        self.wrote = {name for name in self.wrote if (self.folder / name).exists()}
+        self.write()
 
 
 @dataclass
 class Run:
     """A training run of DSOM and its folder: state-*/ (to resume), metrics.jsonl, run.json, and the checkpoint itself.
 
-    ``commit`` is that of the code when this process began, whatever happens to the repository while it trains.
+    ``commit`` is that of the code when this process began, whatever happens to the repository while it trains;
+    ``damaged`` names states that could not be read; ``claim`` is there once the folder is written in.
     """
 
     out: Path
@@ -34,6 +101,8 @@ class Run:
     seconds: float = 0.0
     init: str | None = None
     commit: str = field(default_factory=lambda: commit())
+    damaged: set[str] = field(default_factory=set)
+    claim: Claim | None = None
 
     def record(self) -> dict[str, Any]:
         """What run.json holds."""
@@ -42,23 +111,62 @@ class Run:
 
     def write(self) -> None:
         """Write run.json."""
-        checkpoint.write_json(self.out / "run.json", self.record())
+        checkpoint.write_json(self.out / RUN, self.record())
 
     def states(self) -> list[Path]:
-        """Folders of complete states, oldest first."""
-        return sorted(p for p in self.out.glob("state-*") if p.name[6:].isdigit())
+        """Folders of states, oldest first, without those known to be damaged."""
+        return [path for path in states_in(self.out) if path.name not in self.damaged]
+
+    def newest(self, read: Callable[[Path], S]) -> S | None:
+        """The newest state that ``read`` can read, or None if there is none at all; says which ones are damaged."""
+        reason, found = "", self.states()
+        if not found:
+            return None
+        for path in reversed(found):
+            try:
+                state = read(path)
+            except UserError as error:
+                reason = reason or str(error)
+                self.damaged.add(path.name)
+                continue
+            if reason:
+                print(f"{', '.join(sorted(self.damaged))}: damaged; the run goes on from {path}")
+            return state
+        raise UserError(f"{self.out}: no state can be read ({reason}); train again, with another --out")
+
+    def hold(self) -> Claim:
+        """The claim on the folder. One that has been removed under a run is made again, with ``run.json`` in it."""
+        removed = self.claim is not None and not any((self.out / name).exists() for name in (LOCK, OWNER))
+        if self.claim is None or removed:
+            if self.claim is not None:
+                self.claim.lock.release(force=True)
+            try:
+                self.out.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise UserError(f"{self.out}: cannot write ({error.strerror}); give another --out") from error
+            self.claim = Claim(self.out)
+        if removed:
+            self.write()
+        self.claim.check()
+        return self.claim
 
     def save(self, state: Any, metrics: dict[str, Any]) -> None:
-        """State and checkpoint; the two newest states stay."""
+        """State and checkpoint; the two newest states stay, and so does all that the run has not written."""
         step = int(state.step)
-        checkpoint.save_state(self.out / f"state-{step:08d}", state)
+        claim, name, tag = self.hold(), f"state-{step:08d}", f"weights-{step:08d}"
+        claim.discard(self.damaged & {name})
+        claim.announce(name)
+        # The same step has the same numbers; what is written over in place is broken until it is done.
+        if not (self.out / name).is_dir():
+            checkpoint.save_state(self.out / name, state)
+        self.damaged.discard(name)
         self.write()
-        tag = f"weights-{step:08d}"
-        # A checkpoint that is written over in place is broken until it is done; the same step has the same weights.
         if checkpoint.tag_of(self.out) != tag:
-            checkpoint.save(self.out, self.model(state), self.provenance(step, metrics), tag)
-        for old in self.states()[:-2]:
-            shutil.rmtree(old, ignore_errors=True)
+            claim.discard([tag])
+            claim.announce(tag)
+            checkpoint.write(self.out, self.model(state), self.provenance(step, metrics), tag)
+        keep = {path.name for path in self.states()[-2:]} | {tag}
+        claim.discard(claim.wrote - keep)
 
     def model(self, state: Any) -> Any:
         """The network that is shipped."""
@@ -112,19 +220,26 @@ def read_fields(path: Path | None) -> dict[str, Any]:
 
 def create(run: Run) -> None:
     """The folder of a new run with its run.json."""
+    run.hold()
     try:
-        run.out.mkdir(parents=True, exist_ok=True)
-        run.write()
-    except OSError as error:
-        raise UserError(f"{run.out}: cannot write ({error.strerror}); give another --out") from error
+        check_new(run.out)  # which another process may have begun since it was looked at
+    except UserError:
+        run.claim = None
+        raise
+    run.write()
 
 
-def check_new(out: Path, resume: bool) -> None:
-    """UserError if the folder of a run that is to begin is a file, or (unless ``resume``) not empty."""
+def check_new(out: Path) -> None:
+    """UserError if the folder of a run that is to begin is a file, or not empty but for what a killed start leaves."""
     if out.exists() and not out.is_dir():
         raise UserError(f"--out {out}: is a file; give a folder")
-    if not resume and out.exists() and any(out.iterdir()):
+    if not out.exists():
+        return
+    names = {path.name for path in out.iterdir()}
+    if RUN in names:
         raise UserError(f"{out}: not empty; add --resume to continue that run, or give another --out")
+    if foreign := sorted(name for name in names - {LOCK, OWNER} if not name.startswith((f".{RUN}.", f".{OWNER}."))):
+        raise UserError(f"{out}: not empty ({foreign[0]}) and without {RUN}: no run to resume; give another --out")
 
 
 def reopen(
@@ -135,19 +250,37 @@ def reopen(
     UserError if it is another than ``maps`` and ``steps``, where given, ask for; ``steps`` are those of a run that was
     stopped before it had counted its own.
     """
-    try:
-        record = json.loads(path.read_text())
-        config = read_config(record["config"])
-        rest = (tuple(record["maps"]), record["total"], record["seconds"], record.get("init"))
-        run = kind(path.parent, config, *rest)
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UserError(f"{path}: no run to resume here ({error}); start without --resume") from error
+    record = checkpoint.read_json(path, "restore it, or give another --out")
+    run = kind(path.parent, None, *checked(record, path))
+    run.config = read_config(record["config"])
+    run.hold()
     if maps and tuple(map(str, maps)) != run.maps:
         raise UserError(f"--maps: the run in {path} has {', '.join(run.maps) or 'none'}; resume without --maps")
     if steps is not None and run.total is not None and steps != run.total:
         raise UserError(f"--steps {steps}: the run in {path} has {run.total}; resume without --steps")
     run.total = run.total or steps
     return run
+
+
+def checked(record: Any, path: Path) -> tuple[tuple[str, ...], int | None, float, str | None]:
+    """Maps, steps, seconds and ``init`` of a run.json; UserError for a field that is missing or of another kind."""
+
+    def fits(name: str, *kinds: type) -> Any:
+        if not isinstance(record, dict) or name not in record:
+            raise UserError(f"{path}: no run to resume here (field {name} is missing); give another --out")
+        value = record[name]
+        if not isinstance(value, kinds) or isinstance(value, bool):
+            raise UserError(f"{path}: field {name}: is {str(value)[:40]}; restore the file, or give another --out")
+        return value
+
+    maps, total, seconds = fits("maps", list), fits("total", int, type(None)), fits("seconds", int, float)
+    fits("config", dict)
+    if not all(isinstance(name, str) for name in maps):
+        raise UserError(f"{path}: field maps: holds no names of files; restore the file, or give another --out")
+    if (total is not None and total < 1) or not 0 <= seconds < float("inf"):
+        raise UserError(f"{path}: field total or seconds: out of range; restore the file, or give another --out")
+    init = record.get("init")
+    return tuple(maps), total, float(seconds), init if isinstance(init, str) else None
 
 
 def check_init(init: Path | None, run: Run, path: Path) -> None:
@@ -188,8 +321,27 @@ def commit() -> str:
         return "unknown"
 
 
-def trim_log(path: Path, step: int) -> None:
-    """Drop what a killed run wrote to the log after its last saved state."""
-    lines = path.read_text().splitlines() if path.exists() else []
-    kept = [line for line in lines if line.endswith("}") and json.loads(line)["step"] <= step]
-    write_atomic(path, "".join(line + "\n" for line in kept).encode())
+def states_in(out: Path) -> list[Path]:
+    """Folders of complete states, oldest first."""
+    return sorted(p for p in out.glob("state-*") if p.name[6:].isdigit())
+
+
+def trim_log(path: Path, step: int) -> list[str]:
+    """The lines of the log up to ``step``, to which the file is cut; says how many are damaged and left out."""
+    lines = path.read_bytes().decode(errors="replace").splitlines() if path.exists() else []
+    numbers = [step_of(line) for line in lines]
+    intact = [line for line, number in zip(lines, numbers, strict=True) if number is not None and number <= step]
+    # The last line is half there if its process was killed; any other has suffered something else.
+    if lost := sum(number is None for number in numbers[:-1]):
+        print(f"{path}: {lost} damaged lines, left out")
+    write_atomic(path, "".join(line + "\n" for line in intact).encode())
+    return intact
+
+
+def step_of(line: str) -> int | None:
+    """The step that a line of the log is about, None if it is damaged."""
+    try:
+        step = json.loads(line)["step"]
+    except (ValueError, KeyError, TypeError, RecursionError):
+        return None
+    return step if isinstance(step, int) else None

@@ -79,7 +79,7 @@ def open_run(args: Arguments) -> tuple[Run, Material]:
     if args.resume and path.exists():
         run = resume_run(args, path)
         return run, read_material(args, run)
-    check_new(args.out, args.resume)
+    check_new(args.out)
     begin = None if args.init is None else args.init.name
     run = Run(args.out, read_config(args.config), tuple(str(p) for p in args.maps), args.steps, init=begin)
     # Before anything is written: a bad map or checkpoint leaves no folder behind.
@@ -107,9 +107,8 @@ def resume_run(args: Arguments, path: Path) -> Run:
 
 def first_state(run: Run, network: DSOM | None) -> TrainState:
     """The newest saved state, or a fresh one."""
-    if run.states():
-        return checkpoint.load_state(run.states()[-1], init_state(run.config))
-    return init_state(run.config, network)
+    saved = run.newest(lambda path: checkpoint.load_state(path, init_state(run.config)))
+    return init_state(run.config, network) if saved is None else saved
 
 
 def held_out(run: Run, grids: list[OccupancyGrid]) -> Any:

@@ -88,7 +88,7 @@ def open_run(args: Arguments) -> tuple[FilterRun, Material]:
     if args.resume and path.exists():
         run = resume_run(args, path)
         return run, read_material(args, run)
-    check_new(out, args.resume)
+    check_new(out)
     config = args.read_config(read_fields(args.config), str(args.config))
     if unfit := config.model.misfit(config.data.lidar):
         raise UserError(f"{args.config}: data.lidar: {unfit}; give model: view: what these scans have")
@@ -118,7 +118,8 @@ def resume_run(args: Arguments, path: Path) -> FilterRun:
 def first_state(run: Run, network: Any) -> Any:
     """The newest saved state, or a fresh one."""
     fresh = init_filter_state(run.config, network)
-    return checkpoint.load_state(run.states()[-1], fresh) if run.states() else fresh
+    saved = run.newest(lambda path: checkpoint.load_state(path, fresh))
+    return fresh if saved is None else saved
 
 
 def make_batches(run: Run, grids: list[OccupancyGrid]) -> tuple[Callable[[int, int], Any], Any]:

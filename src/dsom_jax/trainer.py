@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import json
 import math
+import signal
+import sys
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import jax.numpy as jnp
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from dsom_jax.atomic import write_atomic
 from dsom_jax.errors import UserError
-from dsom_jax.run_folder import Run, trim_log
+from dsom_jax.run_folder import OWNER, Run, trim_log
 
 CALIBRATION_STEPS = 30
 
@@ -83,27 +88,48 @@ class Trainer:
         self.state, self.first = parts.state, int(parts.state.step)
         self.saved_at = time.monotonic()
         self.clock = time.monotonic()
-        trim_log(log_path(run), self.first)
+        run.hold()
+        self.lines = trim_log(log_path(run), self.first)
 
     def train(self, progress: Progress) -> dict[str, Any]:
-        """Steps until the end; returns the last evaluation."""
+        """Steps until the end; returns the last evaluation. Ctrl-C or SIGTERM end it after the step under way."""
         done = self.first
         task = progress.add_task("training", total=self.run.total, completed=done, note="compiling")
         batch = self.parts.batches(done, self.total())
-        with log_path(self.run).open("a") as log:
-            while done < self.total():
+        with noted_signals() as signals:
+            while done < self.total() and not signals:
                 self.state, metrics = self.parts.step(self.state, batch, jnp.int32(self.total()))
                 done += 1
                 # The next batch is made while the step runs.
                 batch = self.parts.batches(done, self.total())
                 values = {name: float(value) for name, value in metrics.items()}
                 spent = self.tick(done)
-                log.write(json.dumps({"step": done, **values, "seconds": round(self.run.seconds, 3)}) + "\n")
-                log.flush()
+                self.log({"step": done, **values, "seconds": round(self.run.seconds, 3)})
                 progress.update(task, completed=done, total=self.run.total, note=self.note(values, done, spent))
                 if self.due(done) and done < self.total():
                     self.save(progress)
-        return self.save(progress)
+            if signals and done == self.first:
+                raise SystemExit(128 + signals[0])
+            scores = self.save(progress)
+        if signals and done < self.total():
+            progress.console.print(f"stopped after step {done}, which is saved; --resume goes on", highlight=False)
+            raise SystemExit(128 + signals[0])
+        return scores
+
+    def log(self, record: dict[str, Any]) -> None:
+        """One line more in metrics.jsonl."""
+        self.lines.append(json.dumps(record))
+        path = log_path(self.run)
+        try:
+            if (path.parent / OWNER).exists():  # else it was removed, and :meth:`save` makes it again
+                with path.open("a") as file:
+                    file.write(self.lines[-1] + "\n")
+        except OSError as error:
+            saved = ", ".join(path.name for path in self.run.states()) or "no state"
+            raise UserError(
+                f"{path}: cannot be written ({error.strerror}); {saved} and all before it is intact; "
+                "free some space and go on with --resume"
+            ) from error
 
     def note(self, values: dict[str, float], done: int, spent: float) -> str:
         """Losses and speed, for the progress bar."""
@@ -145,9 +171,33 @@ class Trainer:
         """Evaluate and save; the time it takes is not training time of a step but counts for the run."""
         scores = self.parts.evaluate(self.run.model(self.state))
         self.run.save(self.state, scores)
+        if not log_path(self.run).exists():  # with its folder, while training went on
+            write_atomic(log_path(self.run), "".join(line + "\n" for line in self.lines).encode())
         progress.console.print(f"step {int(self.state.step)}: " + json.dumps(scores))
         self.saved_at = time.monotonic()
         return scores
+
+
+@contextmanager
+def noted_signals() -> Iterator[list[int]]:
+    """A list that the first Ctrl-C or SIGTERM is put into; a second one ends the process at once."""
+    noted: list[int] = []
+    if threading.current_thread() is not threading.main_thread():
+        yield noted
+        return
+
+    def note(number: int, _: Any) -> None:
+        if noted:
+            raise KeyboardInterrupt
+        noted.append(number)
+        print("\nstopping after this step; once more stops at once", file=sys.stderr)
+
+    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield noted
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def log_path(run: Run) -> Path:

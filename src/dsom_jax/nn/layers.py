@@ -1,8 +1,9 @@
-"""Convolution, batch norm and ELU, with gradients written for speed on a CPU.
+"""Convolution, matrix product, batch norm and ELU; on a CPU with gradients of their own, elsewhere with JAX's.
 
 XLA's CPU backend runs a convolution fast only in the layout NHWC, HWIO -> NHWC; the gradients that JAX derives are in
-another one, which falls to a naive loop inside ``scan`` bodies. Here both are spelled out as convolutions in the fast
-layout: the same numbers to rounding.
+another one, which falls to a naive loop inside ``scan`` bodies. On a CPU all are spelled out in the fast layout: the
+same numbers to rounding. On a GPU that would be slow, as the gradient becomes a convolution with a kernel of the size
+of the map; there :func:`own_gradients` says no, and what is differentiated is what Flax's layers compute.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ from dsom_jax.types import Array
 LAYOUT = ("NHWC", "HWIO", "NHWC")
 MOMENTUM = 0.97
 EPSILON = 1e-5
+OWN_GRADIENTS: bool | None = None
+"""Whether layers use the gradients written here; None: on a CPU they do. Looked at when a step is traced."""
 _LARGE = 2048
 """Pixels from which the transposition in the weights' gradient is faster in two steps, each of near neighbours."""
 
@@ -28,13 +31,36 @@ def normal(rng: np.random.Generator, shape: tuple[int, ...], gain: float) -> Arr
     return jnp.asarray(rng.normal(0.0, np.sqrt(gain / np.prod(shape[:-1])), shape), jnp.float32)
 
 
+def own_gradients() -> bool:
+    """The switch of this module: gradients written for a CPU's XLA, or JAX's."""
+    return jax.default_backend() == "cpu" if OWN_GRADIENTS is None else OWN_GRADIENTS
+
+
+def conv3x3(x: Array, kernel: Array) -> Array:
+    """Same-size convolution of x (N, H, W, I) with kernel (3, 3, I, O): (N, H, W, O)."""
+    return _conv3x3(x, kernel) if own_gradients() else _convolve(x, kernel)
+
+
+def product(x: Array, kernel: Array) -> Array:
+    """x (..., I) times kernel (I, O)."""
+    return _product(x, kernel) if own_gradients() else x @ kernel
+
+
+def batch_norm_elu(x: Array, scale: Array, bias: Array) -> tuple[Array, Array, Array]:
+    """ELU of the batch-normalised x (..., C), and the mean and variance (C,) used (constants to the gradient)."""
+    if own_gradients():
+        return _batch_norm_elu(x, scale, bias)
+    channels = tuple(range(x.ndim - 1))
+    mean, variance = x.mean(channels), x.var(channels)
+    return elu((x - mean) * (scale * jax.lax.rsqrt(variance + EPSILON)) + bias), mean, variance
+
+
 def _convolve(x: Array, kernel: Array) -> Array:
     return jax.lax.conv_general_dilated(x, kernel, (1, 1), [(1, 1), (1, 1)], dimension_numbers=LAYOUT)
 
 
 @jax.custom_vjp
-def conv3x3(x: Array, kernel: Array) -> Array:
-    """Same-size convolution of x (N, H, W, I) with kernel (3, 3, I, O): (N, H, W, O)."""
+def _conv3x3(x: Array, kernel: Array) -> Array:
     return _convolve(x, kernel)
 
 
@@ -53,12 +79,11 @@ def _conv3x3_bwd(saved: tuple[Array, Array], gradient: Array) -> tuple[Array, Ar
     return of_input, of_kernel.transpose(1, 2, 0, 3)
 
 
-conv3x3.defvjp(_conv3x3_fwd, _conv3x3_bwd)
+_conv3x3.defvjp(_conv3x3_fwd, _conv3x3_bwd)
 
 
 @jax.custom_vjp
-def product(x: Array, kernel: Array) -> Array:
-    """x (..., I) times kernel (I, O)."""
+def _product(x: Array, kernel: Array) -> Array:
     return x @ kernel
 
 
@@ -74,7 +99,7 @@ def _product_bwd(saved: tuple[Array, Array], gradient: Array) -> tuple[Array, Ar
     return gradient @ kernel.T, jax.lax.dot_general(left, right, (((0,), (0,)), ((), ())))
 
 
-product.defvjp(_product_fwd, _product_bwd)
+_product.defvjp(_product_fwd, _product_bwd)
 
 
 def elu(x: Array) -> Array:
@@ -102,14 +127,13 @@ def moments(x: Array) -> tuple[Array, Array]:
 
 
 @jax.custom_vjp
-def batch_norm_elu(x: Array, scale: Array, bias: Array) -> tuple[Array, Array, Array]:
-    """ELU of the batch-normalised x (..., C), and the mean and variance (C,) used (constants to the gradient)."""
+def _batch_norm_elu(x: Array, scale: Array, bias: Array) -> tuple[Array, Array, Array]:
     mean, variance = moments(x)
     return elu((x - mean) * (scale * jax.lax.rsqrt(variance + EPSILON)) + bias), mean, variance
 
 
 def _batch_norm_elu_fwd(x: Array, scale: Array, bias: Array):
-    out, mean, variance = batch_norm_elu(x, scale, bias)
+    out, mean, variance = _batch_norm_elu(x, scale, bias)
     return (out, mean, variance), (x, out, scale, mean, variance)
 
 
@@ -125,7 +149,7 @@ def _batch_norm_elu_bwd(saved, gradients):
     return of_x, of_scale, of_bias
 
 
-batch_norm_elu.defvjp(_batch_norm_elu_fwd, _batch_norm_elu_bwd)
+_batch_norm_elu.defvjp(_batch_norm_elu_fwd, _batch_norm_elu_bwd)
 
 
 class BatchNormELU(nnx.Module):
