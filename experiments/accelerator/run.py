@@ -30,13 +30,13 @@ from dsom_jax.compiling import run_options
 from dsom_jax.data.suite import load_suite
 from dsom_jax.errors import UserError, run_cli
 from dsom_jax.filters.methods import Settings, build_filter
+from dsom_jax.judging.quality import make_evaluation
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.nn import DSOMConfig
 from dsom_jax.occupancy import OccupancyGrid, from_cells
 from dsom_jax.proposals.likelihood_grid import LikelihoodGrid, likelihood_grid
 from dsom_jax.simulate.worlds import WorldConfig, make_world
 from dsom_jax.training.batches import ScanConfig, make_batch, plain
-from dsom_jax.training.evaluation import make_evaluation
 from dsom_jax.training.loop import (
     StageConfig,
     TrainConfig,
