@@ -16,10 +16,10 @@ LAYERS = (
     ("occupancy", "lidar", "marching", "raycast", "resampling", "pose_grid", "episode"),
     ("motion", "sensor", "nn", "simulate"),
     ("proposals",),
-    ("filters", "training", "montecarlo"),
+    ("filters", "training", "montecarlo", "ambiguity"),
     ("atomic", "data", "checkpoint", "run_folder", "trained", "plotting", "report", "judging", "view"),
     ("live",),
-    ("cli", "trainer", "train", "train_filter", "bench", "localize", "evaluate", "protocol", "ros2"),
+    ("cli", "trainer", "train", "train_filter", "bench", "localize", "demo", "certify", "evaluate", "protocol", "ros2"),
 )
 DEVICE = 5
 """Layers below this are device code."""

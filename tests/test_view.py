@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import base64
+import io
 import json
 import re
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 import made_story
 from dsom_jax.view import Field, Lookalike, Story, render, trajectory_figure
@@ -67,7 +68,7 @@ def test_what_is_packed_is_what_was_told(html):
 
 def test_the_map_is_upright(html):
     image = unpacked(html)["map"]["png"].removeprefix("data:image/png;base64,")
-    pixels = cv2.imdecode(np.frombuffer(base64.b64decode(image), np.uint8), cv2.IMREAD_GRAYSCALE)[::-1]
+    pixels = np.asarray(Image.open(io.BytesIO(base64.b64decode(image))))[::-1]
     plan = made_story.plan()
     assert ((pixels == 255) == plan.occupied).all() and ((pixels == 128) == plan.free).all()
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import base64
+import io
 import json
 import time
 
-import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 import made_story
 from browser import AXE, needs_axe, needs_browser, opened, resize, theme
@@ -57,7 +58,7 @@ def picture(page):
     """What is drawn on the map (H, W, 4), once it has been drawn."""
     time.sleep(0.2)
     uri = page.execute_script("return document.getElementById('map').toDataURL()")
-    return cv2.imdecode(np.frombuffer(base64.b64decode(uri.split(",")[1]), np.uint8), cv2.IMREAD_UNCHANGED)
+    return np.asarray(Image.open(io.BytesIO(base64.b64decode(uri.split(",")[1]))).convert("RGBA"))
 
 
 def brightness(page):
@@ -132,7 +133,7 @@ def test_follow_and_zoom(page):
     assert (picture(page) == whole).all()
     click(page, "follow")
     near = picture(page)
-    blue = (np.abs(near[..., :3].astype(int) - [0xAD, 0x5C, 0x0B]).sum(-1) < 30).nonzero()
+    blue = (np.abs(near[..., :3].astype(int) - [0x0B, 0x5C, 0xAD]).sum(-1) < 30).nonzero()
     # The estimate, an arrow of 23 pixels, is in the middle.
     middle = np.array(near.shape[:2]) / 2
     assert (np.abs(np.stack(blue, -1) - middle).max(-1) < 14).sum() > 60

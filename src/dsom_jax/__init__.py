@@ -6,8 +6,14 @@ each is imported at its first use, so that ``import dsom_jax`` costs nothing.
 
 from __future__ import annotations
 
+import os
+import sys
 from importlib import import_module
 from typing import Any
+
+if sys.argv[:1] == ["-m"]:  # a command line of this package, before JAX is there
+    # XLA's alarms (slow folding of constants, features of other processors) say nothing to who looks for a robot.
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 _PUBLIC = {
     "checkpoint": ("load", "load_provenance", "save"),

@@ -3,13 +3,25 @@
 from __future__ import annotations
 
 import io
+import os
 import re
-from collections.abc import Callable
-from contextlib import redirect_stderr
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, redirect_stderr, suppress
+from pathlib import Path
 from typing import TypeVar
 
+import jax
 import tyro
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    SpinnerColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)  # fmt: skip
 
 from dsom_jax import report
 from dsom_jax.errors import UserError
@@ -24,8 +36,10 @@ _FRAME = re.compile(r"\x1b\[[0-9;]*m|[│╭╮╰╯]|^\s*[|+]|[|+]\s*$")
 def parse(arguments: type[T], prog: str) -> T:
     """The dataclass ``arguments`` from the words of the command line; UserError for words that do not fit it.
 
-    ``prog`` is what the user typed before them, such as ``python -m dsom_jax.bench``.
+    ``prog`` is what the user typed before them, such as ``python -m dsom_jax.bench``. What is compiled from here on is
+    kept for the next time.
     """
+    keep_compiled()
     box = io.StringIO()
     try:
         with redirect_stderr(box):
@@ -42,6 +56,48 @@ def one_line(box: str) -> str:
     sections = [part for part in re.split(r"[─-]{3,}", " ".join(row for row in rows if row)) if part.strip()] or [""]
     told = [sections[0], *(part for part in sections[1:2] if part.lstrip().startswith("Perhaps"))]
     return "; ".join(part.strip().rstrip(".:") for part in told)
+
+
+def keep_compiled() -> None:
+    """Let JAX keep what it compiles in the user's cache folder, unless the environment names another or forbids it."""
+    if "JAX_COMPILATION_CACHE_DIR" in os.environ:
+        return
+    folder = cache_folder() / "jax"
+    with suppress(OSError):  # without a place to write to, everything works, and is compiled every time
+        folder.mkdir(parents=True, exist_ok=True)
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+
+
+def cache_folder() -> Path:
+    """Where programs of this user keep what they can make again."""
+    if sys.platform == "darwin":
+        return Path.home() / "Library" / "Caches" / "dsom_jax"
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "dsom_jax"
+
+
+@contextmanager
+def stage(says: str) -> Iterator[None]:
+    """A line on stderr with the seconds that something without a known length takes; gone when it is done."""
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+    with Progress(*columns, console=report.terminal(stderr=True), transient=True) as bar:
+        bar.add_task(says, total=None)
+        yield
+
+
+def each(items: Sequence[T], says: str) -> Iterable[T]:
+    """``items`` one after another, with a bar on stderr; the first includes the compilation, and is not reckoned with
+    in the time that is left."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
+               TextColumn("left"), TimeRemainingColumn())  # fmt: skip
+    with Progress(*columns, console=report.terminal(stderr=True), transient=True) as bar:
+        task = bar.add_task(f"{says}: the first one, with compiling, once", total=len(items))
+        for number, item in enumerate(items, 1):
+            yield item
+            if number == 1:
+                bar.reset(task, total=len(items), completed=1, description=says)
+            else:
+                bar.update(task, completed=number)
 
 
 def progress_bar(total: int) -> tuple[Progress, Advance]:

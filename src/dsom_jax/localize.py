@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import json
+import sys
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from rich.progress import Progress
+from rich import box
+from rich.table import Table
 
 from dsom_jax import checkpoint, report
-from dsom_jax.cli import parse
+from dsom_jax.cli import each, parse, stage
 from dsom_jax.data import RawLog, Report, load_log, load_map
 from dsom_jax.data.cut import segment_indices, splice, to_episode, without_repeats
 from dsom_jax.data.log import limited
@@ -75,6 +80,8 @@ class Args:
     """Beams used for weighing."""
     seed: int = 0
     """Seed of all randomness."""
+    json: bool = False
+    """Print summary.json instead of a table."""
 
 
 MANY = 1_000_000
@@ -84,24 +91,46 @@ def main() -> None:
     """Command line."""
     args = parse(Args, "python -m dsom_jax.localize")
     check(args)
+    folder = report.output_folder(args.out)
+    summary = answer(args)
+    if args.json:
+        print(json.dumps(report.plain(summary), indent=2))
+    else:
+        print_summary(summary, folder)
+
+
+def answer(args: Args, carried: Sequence[float] = ()) -> dict[str, Any]:
+    """Read, localize, judge and write everything; what ``summary.json`` holds.
+
+    ``carried`` are stamps at which the robot is known to have been carried away, which no log tells.
+    """
     left_out = Report()
     grid = load_map(args.map, left_out)
     log = load_log(args.log, reference=args.reference, scan_topic=args.scan_topic, odom_topic=args.odom_topic)
     log = limited(log, args.laser_max_range)
     reports = ((args.map, left_out), (args.log, log.report))
     notes = [f"{file.name}: {line}" for file, report_of in reports for line in report_of.lines()]
-    print("".join(f"{note}\n" for note in notes), end="")
-    drives = cut(log, args)
+    print("".join(f"{note}\n" for note in notes), end="", file=sys.stderr if args.json else sys.stdout)
+    drives = [marked(drive, carried) for drive in cut(log, args)]
     network = load_network(args, log.lidar)
     folder = report.output_folder(args.out)
-    filter = build(args, grid, log.lidar, network)
-    with Progress(console=report.terminal(stderr=True)) as progress:
-        outcomes = localize(filter, progress.track(drives, description="segments"), args.runs, args.seed)
+    with stage("expected ranges from every place of the map"):
+        filter = jax.block_until_ready(build(args, grid, log.lidar, network))
+    outcomes = localize(filter, each(drives, "segments"), args.runs, args.seed)
     summary = summarize(outcomes, grid, args)
-    report.write_json(folder / "summary.json", summary)
-    save_estimate(folder / "estimate.tum", outcomes)
-    write_view(folder, outcomes, grid, log.lidar, summary, notes, args)
-    print_summary(summary)
+    with stage("writing the page"):
+        report.write_json(folder / "summary.json", summary)
+        save_estimate(folder / "estimate.tum", outcomes)
+        write_view(folder, outcomes, grid, log.lidar, summary, notes, args)
+    return summary
+
+
+def marked(drive: Drive, carried: Sequence[float]) -> Drive:
+    """The drive with the first update from each of the stamps ``carried`` on marked as after a kidnapping."""
+    first = np.searchsorted(drive.stamps, np.asarray(carried, float) - 1e-6)
+    flags = np.asarray(drive.episode.kidnapped).copy()
+    flags[first[(first > 0) & (first < len(flags))]] = True
+    return drive._replace(episode=drive.episode._replace(kidnapped=jnp.asarray(flags))) if len(carried) else drive
 
 
 def check(args: Args) -> None:
@@ -229,21 +258,45 @@ def summarize(outcomes: list[Outcome], grid: OccupancyGrid, args: Args) -> dict[
     return head | scores(outcomes, grid, args.method, args.seed)
 
 
-def print_summary(summary: dict[str, Any]) -> None:
-    """One line for a person."""
-    if "converged" not in summary:
-        print(
-            f"{summary['updates']} updates, confident in {summary['confident']:.1%} of them; no reference to judge by"
-        )
-        return
-    for name, part in (("start", summary), ("kidnapping", summary.get("kidnap"))):
-        if part:
-            print(
-                f"{name}: converged {part['converged']:.1%} after {part['steps_median']:g} updates (median), "
-                f"retention {part['retention']:.2%}, strict success {part['strict_success']:.1%}, "
-                f"median final error {part['e_pos_m_median']:.3f} m"
-            )
-    print(f"{summary['ms_per_update']:.1f} ms per update of all {summary['runs']} runs")
+COLUMNS = (
+    ("runs", "experiments", "{:d}"), ("found", "converged", "{:.1%}"), ("updates until then", "steps_median", "{:g}"),
+    ("metres", "metres_median", "{:.1f}"), ("still right later", "retention", "{:.1%}"),
+    ("error at the end", "e_pos_m_median", "{:.3f} m"), ("sure and wrong", "false_confident", "{:.2%}"),
+)  # fmt: skip
+"""Of the table for a person: head, key of ``summary.json``, format. Medians are those of the runs that found."""
+
+
+def print_summary(summary: dict[str, Any], folder: Path) -> None:
+    """One table for a person, and what to look at."""
+    console = report.terminal()
+    if "converged" in summary:
+        table = Table(box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 2, 0, 0))
+        table.add_column("")
+        for head, _, _ in COLUMNS:
+            table.add_column(head, justify="right")
+        for name, part in (("start anywhere", summary), ("carried away", summary.get("kidnap"))):
+            if part:
+                table.add_row(name, *(_cell(part[key], text) for _, key, text in COLUMNS))
+        console.print(table)
+    else:
+        sure = f"{summary['updates']} updates, sure of the answer in {summary['confident']:.1%} of them"
+        console.print(f"{sure}; no reference to judge by")
+    console.print(f"{summary['ms_per_update']:.1f} ms per update of all {summary['runs']} runs", style="dim")
+    console.print(f"look at {folder / 'report.html'}{worst(summary)}", soft_wrap=True, highlight=False)
+
+
+def worst(summary: dict[str, Any]) -> str:
+    """Which segment to look at first, if any failed."""
+    parts = [part.get("converged") for part in summary.get("by_segment", [])]
+    rates = [1.0 if rate is None or rate != rate else rate for rate in parts]
+    if not rates or min(rates) == 1:
+        return ""
+    number = int(np.argmin(rates)) + 1
+    return f"#d={number} (segment {number}: found in {min(rates):.0%} of the runs)"
+
+
+def _cell(value: Any, text: str) -> str:
+    return "-" if value is None or value != value else text.format(value)
 
 
 if __name__ == "__main__":

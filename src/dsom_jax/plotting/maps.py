@@ -44,7 +44,7 @@ def map_view(
     """
     free, occupied = np.asarray(grid.free), np.asarray(grid.occupied)
     shade = np.where(occupied, 0.15, np.where(free, 1.0, 0.8))
-    _raster(ax, shade, np.asarray(grid.origin), grid.resolution, cmap="gray", vmin=0, vmax=1)
+    raster(ax, shade, np.asarray(grid.origin), grid.resolution, cmap="gray", vmin=0, vmax=1)
     if pm is not None:
         _draw_pm(ax, pm, grid.origin if pm_origin is None else pm_origin, pm_resolution or grid.resolution)
     if points is not None:
@@ -120,10 +120,10 @@ def _draw_pm(ax: Axes, pm: np.ndarray, origin: Any, resolution: float) -> None:
     mass = mass.sum(-1) if mass.ndim == 3 else mass
     peak = mass.max() or 1.0
     shown = np.ma.masked_less(mass, 1e-4 * peak)
-    _raster(ax, shown, np.asarray(origin), resolution, cmap="YlOrRd", norm=LogNorm(1e-4 * peak, peak), alpha=0.8)
+    raster(ax, shown, np.asarray(origin), resolution, cmap="YlOrRd", norm=LogNorm(1e-4 * peak, peak), alpha=0.8)
 
 
-def _raster(ax: Axes, cells: np.ndarray, origin: np.ndarray, resolution: float, **style: Any) -> None:
+def raster(ax: Axes, cells: np.ndarray, origin: np.ndarray, resolution: float, **style: Any) -> None:
     """Cells (H, W), row 0 lowest, in the map frame; ``origin`` is the pose of their lower-left corner."""
     height, width = cells.shape[0] * resolution, cells.shape[1] * resolution
     placed = Affine2D().rotate(float(origin[2])).translate(float(origin[0]), float(origin[1]))

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import base64
+import io
 from typing import Any
 
-import cv2
 import numpy as np
+from PIL import Image
 
 from dsom_jax.view.story import VERDICTS, DriveStory, Field, Plan, Story, fewer_particles, moments
 
@@ -111,8 +112,9 @@ def _box(plan: Plan) -> np.ndarray:
 
 def _png(pixels: np.ndarray) -> str:
     """Data URI of grey pixels (H, W), first row at the top."""
-    _, content = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 9])
-    return "data:image/png;base64," + base64.b64encode(content.tobytes()).decode()
+    content = io.BytesIO()
+    Image.fromarray(pixels).save(content, "PNG", optimize=True)
+    return "data:image/png;base64," + base64.b64encode(content.getvalue()).decode()
 
 
 def _encoded(values: Any, kind: str) -> str:
