@@ -259,9 +259,9 @@ def summarize(outcomes: list[Outcome], grid: OccupancyGrid, args: Args) -> dict[
 
 
 COLUMNS = (
-    ("runs", "experiments", "{:d}"), ("found", "converged", "{:.1%}"), ("updates until then", "steps_median", "{:g}"),
-    ("metres", "metres_median", "{:.1f}"), ("still right later", "retention", "{:.1%}"),
-    ("error at the end", "e_pos_m_median", "{:.3f} m"), ("sure and wrong", "false_confident", "{:.2%}"),
+    ("runs", "experiments", "{:d}"), ("found", "converged", "{:.1%}"), ("updates", "steps_median", "{:g}"),
+    ("metres", "metres_median", "{:.1f}"), ("right later", "retention", "{:.1%}"),
+    ("error", "e_pos_m_median", "{:.3f} m"), ("sure and wrong", "false_confident", "{:.2%}"),
 )  # fmt: skip
 """Of the table for a person: head, key of ``summary.json``, format. Medians are those of the runs that found."""
 

@@ -96,13 +96,15 @@ def headline(summary: dict[str, Any]) -> str:
     starts = summary["experiments"]
     text = f"Started anywhere, the robot was found in {shown(summary['converged'], 'percent')} of {starts} runs"
     if summary["metres_median"] == summary["metres_median"]:  # none was found: not a number
-        text += f", after {shown(summary['metres_median'], 'metres')} of driving (median)"
+        driven = summary["metres_median"]
+        text += f", after {shown(driven, 'metres')} of driving (median)" if driven >= 0.1 else ", at once (median)"
     if "kidnap" in summary:
         text += f". Carried away unnoticed, it was found again in {shown(summary['kidnap']['converged'], 'percent')}"
-    fooled = summary["false_confident"]
-    if not fooled:
-        return f"{text}. It was never sure and wrong."
-    return f"{text}. At {shown(fooled, 'percent')} of the updates it was sure and wrong."
+    rates = [("the updates", summary["false_confident"])]
+    if "kidnap" in summary:
+        rates.append(("the updates after it was carried away", summary["kidnap"]["false_confident"]))
+    fooled = [f"{shown(rate, 'percent')} of {where}" for where, rate in rates if rate > 0]
+    return f"{text}. It was sure and wrong at {' and at '.join(fooled) if fooled else 'none of the updates'}."
 
 
 def _drive(name: str, outcome: Outcome, said: Answers) -> DriveStory:

@@ -48,7 +48,7 @@ def _tiles(story: Story) -> str:
         if value is None:
             continue
         bounds = story.summary.get(f"{key}_ci95")
-        note = label + (f" [{', '.join(shown(b, kind) for b in bounds)}]" if bounds else "")
+        note = label + (f" [{' to '.join(shown(b, kind) for b in bounds)}]" if bounds else "")
         rows.append(f'<li><b data-key="{escape(key)}" data-value="{value!r}">{shown(value, kind)}</b>'
                     f"<span>{escape(note)}</span></li>")  # fmt: skip
     return f'<ul class="tiles">{"".join(rows)}</ul>' if rows else ""
