@@ -11,7 +11,8 @@ import pytest
 from dsom_jax.data import load_tum
 from dsom_jax.episode import Episode
 from dsom_jax.judging import scores as judging
-from dsom_jax.judging.scores import Drive, Outcome
+from dsom_jax.judging.rooms import rooms_of
+from dsom_jax.judging.scores import Answers, Drive, Outcome
 from dsom_jax.montecarlo import Result
 from dsom_jax.occupancy import from_cells
 
@@ -42,18 +43,36 @@ def outcome(late: tuple[int, int], start: float = 100.0, mean_off: float = 1.0, 
 
 
 def scored(*outcomes, method="adam_robust", seed=0):
-    return judging.scores(list(outcomes), GRID, method, seed)
+    given = [judging.answers(o.result.info, judging.judged_by(method)) for o in outcomes]
+    return judging.scores([o.drive for o in outcomes], given, GRID, seed, rooms_of(GRID))
 
 
 def test_both_phases_by_hand():
     found = scored(outcome((2, 8)), outcome((1, 2)))
-    # One run of four has not got right before the kidnapping; after it the same; what comes after AGAIN is not judged.
+    # One run of four has not got right before the kidnapping. After the first one it is the same, after AGAIN nobody is
+    # found: both count.
+    assert found["experiments"] == 4 and found["converged"] == 0.75 and found["steps_median"] == 2
+    assert found["kidnap"]["experiments"] == 8 and found["kidnap"]["converged"] == 3 / 8
+    assert found["drives"] == found["kidnap"]["drives"] == 2
     for phase, speed in ((found, 0.5), (found["kidnap"], 0.25)):
-        assert phase["experiments"] == 4 and phase["converged"] == 0.75 and phase["steps_median"] == 2
         assert phase["metres_median"] == pytest.approx(2 * speed)
         assert phase["e_pos_m_median"] == pytest.approx(0.1, abs=1e-5)
-        # The filter claims to know exactly where it errs: of 32 updates 2 + 8 + 1 + 2.
-        assert phase["false_confident"] == pytest.approx(13 / 32)
+    # The filter claims to know exactly where it errs: of 32 updates 2 + 8 + 1 + 2, after AGAIN at all of them.
+    assert found["false_confident"] == pytest.approx(13 / 32)
+    assert found["kidnap"]["false_confident"] == pytest.approx((13 + 32) / 64)
+    # What it says of itself is the wrong way round.
+    assert found["p_lost"]["auroc"] == 0 and found["p_lost"]["answers"] == 2 * 2 * UPDATES
+    # One room, in which every answer is.
+    assert found["right_room"] == 1
+
+
+def test_a_system_that_says_nothing_of_itself_is_judged_by_its_poses():
+    one = outcome((0, 0))
+    poses = np.asarray(one.result.info.cluster)[:1].copy()
+    poses[0, :4] = np.nan  # no answer yet
+    found = judging.scores([one.drive], [Answers(poses)], GRID)
+    assert "p_lost" not in found and np.isnan(found["false_confident"]) and found["converged"] == 0
+    assert found["kidnap"]["converged"] == 0.5 and "right_room" not in found
 
 
 def test_a_drive_without_kidnapping_has_one_phase():

@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import binomtest
-from scipy.stats import bootstrap as scipy_bootstrap
 
 from dsom_jax.judging import metrics
 
@@ -67,7 +66,7 @@ def test_unknown_truth_is_nan_but_a_broken_estimate_is_an_infinite_error():
     ],
 )
 def test_convergence_step(pattern, step):
-    assert metrics.convergence_step(*errors(pattern)) == [step]
+    assert metrics.measure_errors(*errors(pattern)).steps.tolist() == [step]
 
 
 def slow_step(inside: list[bool | None], hold: int) -> int:
@@ -84,17 +83,17 @@ def slow_step(inside: list[bool | None], hold: int) -> int:
     st.integers(1, 6),
 )
 @settings(max_examples=200, deadline=None)
-def test_convergence_step_against_a_slow_search_over_batch_axes(rows, hold):
-    e_pos = np.array([[np.nan if flag is None else 1.0 if flag else 3.0 for flag in row] for row in rows])
-    steps = metrics.convergence_step(e_pos[None], 0 * e_pos[None], hold=hold)
+def test_streaks_against_a_slow_search_over_batch_axes(rows, hold):
+    flags = np.array([[bool(flag) for flag in row] for row in rows])
+    valid = np.array([[flag is not None for flag in row] for row in rows])
+    steps, _ = metrics.first_streak(flags[None], valid[None], hold)
     assert steps.tolist() == [[slow_step(row, hold) for row in rows]]
 
 
 def test_thresholds_are_strict():
-    at = np.full(5, 2.0), np.zeros(5)
-    assert metrics.convergence_step(*at) == -1
-    assert metrics.convergence_step(at[0] - 1e-9, at[1] + 9.999 * DEG) == 0
-    assert metrics.convergence_step(at[0] - 1e-9, at[1] + 10.001 * DEG) == -1
+    e_pos, e_theta = np.full((3, 5), 2.0 - 1e-9), np.array([[0.0], [9.999], [10.001]]) * DEG * np.ones(5)
+    e_pos[0] = 2.0
+    assert metrics.measure_errors(e_pos, e_theta).steps.tolist() == [-1, 0, -1]
 
 
 def test_retention_counts_updates_after_the_streak_and_only_known_ones():
@@ -125,37 +124,16 @@ def test_runs_without_any_reference_are_no_experiments():
 def test_strict_success_is_of_the_last_update():
     e_pos = np.array([[0.4], [0.6], [0.4], [0.1]])
     e_theta = np.array([[4.0], [1.0], [6.0], [4.9]]) * DEG
-    assert metrics.strict_success(metrics.measure_errors(e_pos, e_theta)).tolist() == [True, False, False, True]
+    assert metrics.measure_errors(e_pos, e_theta).strict.tolist() == [True, False, False, True]
 
 
 def test_false_confidence():
-    lost = np.array([[0.01, 0.01, 0.9, 0.9, 0.04], [np.nan] * 5])
-    runs = metrics.measure_errors(*errors("+-+-? -----"), lost)
+    certain = np.array([[True, True, False, False, True]])
+    claiming, silent = metrics.measure_errors(*errors("+-+-?"), certain), metrics.measure_errors(*errors("-----"))
+    runs = metrics.pool([claiming, silent])
     assert metrics.false_confident(runs) == pytest.approx(1 / 4)  # the silent run claims nothing and is not counted
     assert metrics.summarize(runs)["confident"] == pytest.approx(2 / 4)
     assert math.isnan(metrics.false_confident(metrics.measure_errors(*errors("+++++"))))
-
-
-@given(st.integers(0, 300), st.integers(1, 300))
-@settings(deadline=None)
-def test_wilson_against_scipy(successes, trials):
-    successes = min(successes, trials)
-    expected = binomtest(successes, trials).proportion_ci(method="wilson")
-    np.testing.assert_allclose(metrics.wilson(successes / trials, trials), expected, atol=1e-9)
-
-
-def test_wilson_without_trials_knows_nothing():
-    assert metrics.wilson(math.nan, 0) == [0.0, 1.0]
-
-
-def test_bootstrap_against_scipy_and_is_reproducible():
-    values = np.random.default_rng(1).exponential(2.0, 200)
-    ours = metrics.bootstrap(values, seed=3)
-    assert ours == metrics.bootstrap(values, seed=3) != metrics.bootstrap(values, seed=4)
-    theirs = scipy_bootstrap((values,), np.mean, method="percentile", rng=5).confidence_interval
-    # The standard error of a 2.5 % quantile of 2000 draws is about 0.06 of their standard deviation; five of these.
-    np.testing.assert_allclose(ours, theirs, atol=0.3 * values.std() / math.sqrt(200))
-    assert np.isnan(metrics.bootstrap(np.zeros(0))).all()
 
 
 def test_histogram_has_every_run_once():
@@ -178,16 +156,35 @@ def test_metres_travelled():
 
 
 def test_summary():
-    runs = metrics.measure_errors(*errors("+++++++++- -+++++++++ ----------"), np.zeros((3, 10)))
+    rows = [metrics.measure_errors(*errors(p), np.ones((1, 10), bool), drive=n)
+            for n, p in enumerate(("+++++++++-", "-+++++++++", "----------"))]  # fmt: skip
+    runs = metrics.pool(rows)
     m = metrics.summarize(runs)
     assert set(m) >= REQUIRED
-    assert m["experiments"] == 3 and m["converged"] == pytest.approx(2 / 3)
+    assert m["experiments"] == m["drives"] == 3 and m["converged"] == pytest.approx(2 / 3)
     assert m["converged_ci95"] == pytest.approx(list(binomtest(2, 3).proportion_ci(method="wilson")))
     assert m["steps_median"] == 0.5 and m["steps_hist"]["0-20"] == 2 and m["steps_hist"]["never"] == 1
     assert m["e_pos_m"] == pytest.approx(4.55) and m["final_e_pos_m_all"] == pytest.approx(18.1 / 3)
     assert m["retention"] == pytest.approx(8 / 9) and m["re_loss"] == 0.5
     assert m["strict_success"] == pytest.approx(1 / 3)
     assert m["false_confident"] == pytest.approx(12 / 30)
+    # Two drives have updates after convergence, 5 of them 4 inside, and 4 of them all.
+    assert m["retention_ci95"] == [0.8, 1.0]
+
+
+def test_runs_of_one_drive_do_not_narrow_an_interval():
+    e_pos = np.where(np.arange(200)[:, None] % 2, 9.0, 0.1) * np.ones(6)
+    many = [metrics.measure_errors(e_pos[:n] + shift, 0 * e_pos[:n], drive=shift) for n, shift in ((200, 0), (2, 1))]
+    one = metrics.summarize(many[0])
+    assert one["experiments"] == 200 and one["drives"] == 1 and one["converged_ci95"] == [0.0, 1.0]
+    assert np.isnan(one["e_pos_ci95"]).all()
+    # Retention is over the updates of all runs of a drive: each of two drives is drawn twice in a quarter of them.
+    a, b = (
+        metrics.measure_errors(*errors("+++++++--- ++++++++++")),
+        metrics.measure_errors(*errors("++++++----"), drive=1),
+    )
+    m = metrics.summarize(metrics.pool([a, b]))
+    assert m["retention"] == pytest.approx((2 + 5 + 1) / 15) and m["retention_ci95"] == [0.2, 0.7]
 
 
 def test_summary_of_nothing():

@@ -14,14 +14,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import yaml
+from scipy.stats import binomtest
 
-from dsom_jax import checkpoint, report, train, train_filter
+from dsom_jax import checkpoint, plotting, report, train, train_filter
 from dsom_jax.cli import parse
 from dsom_jax.data.suite import Suite
 from dsom_jax.episode import Episode
 from dsom_jax.errors import UserError
 from dsom_jax.filters.methods import DRAWN, LEARNED
 from dsom_jax.judging.metrics import measure_errors, pool, summarize
+from dsom_jax.judging.run_table import join, run_rows, write_runs
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.occupancy import from_cells
 from dsom_jax.protocol import adapting, clips, command, reporting, running
@@ -97,7 +99,7 @@ def test_results_are_kept_only_of_the_same_map_logs_and_network(tmp_path):
     first = running.identity(variant, plan, made_suite(grid), start)
     (tmp_path / f"{variant.stem}.json").write_text(json.dumps(first))
     assert not running.is_done(variant, first, tmp_path)  # no runs to compare
-    (tmp_path / f"{variant.stem}.json").write_text(json.dumps(first | {"each_run": {}}))
+    (tmp_path / f"{variant.stem}.npz").touch()
     assert running.is_done(variant, first, tmp_path)
     again = running.identity(variant, plan, made_suite(grid), start)
     moved = from_cells(grid.occupied, grid.free, resolution=0.1, origin=(0.01, 0.0, 0.0))
@@ -194,7 +196,7 @@ def test_filters_are_trained_on_with_words_that_their_training_knows(kind, monke
 def made_like(**changes: Any) -> dict[str, Any]:
     """A result as far as comparisons ask for it."""
     same = {"map_digest": "m", "clips_digest": "c", "seed": 0, "runs": 2, "particles": 9, "clips": 3, "updates": 8}
-    return same | {"each_run": {}, "network": None} | changes
+    return same | {"network": None} | changes
 
 
 @pytest.mark.parametrize(
@@ -267,18 +269,39 @@ def test_networks_of_two_kinds_need_not_be_one():
     assert reporting.comparable(sides, *sides)
 
 
-def test_results_without_their_runs_have_a_table_and_no_tests(tmp_path):
-    """As results were before they held their runs."""
+def test_the_report_of_results_is_written_by_clip(tmp_path):
     (tmp_path / "hall").mkdir()
-    plan = Plan(methods=("mcl", "adam_likelihood_grid"), maps={"hall": {}})
-    phase = summarize(pool([measure_errors(np.full((2, 9), 0.1), np.zeros((2, 9)), np.zeros((2, 9)))]))
-    old = made_like(commit="c", map_kind="scanned", **dict.fromkeys(reporting.PHASES, phase))
-    del old["each_run"]
-    for variant in variants(plan):
-        report.write_json(tmp_path / "hall" / f"{variant.stem}.json", old)
+    plan = Plan(methods=("mcl", "adam_likelihood_grid"), maps={"hall": {}}, t_cuts=(0.6,))
+    rng = np.random.default_rng(0)
+    for variant, off in zip(variants(plan), (1.9, 0.1), strict=True):
+        rows, phases = [], {}
+        for phase in reporting.PHASES:
+            parts = [measure_errors(off + 0.05 * rng.random((4, 9)), np.zeros((4, 9)), drive=clip) for clip in range(3)]
+            rows += [run_rows(variant.method, phase, clip, 0, runs) for clip, runs in enumerate(parts)]
+            phases[phase] = summarize(pool(parts))
+        report.write_json(tmp_path / "hall" / f"{variant.stem}.json", made_like(commit="c", map_kind="s", **phases))
+        bands = plotting.bands_of([off + rng.random((4, 18)) for _ in range(3)])
+        write_runs(tmp_path / "hall" / f"{variant.stem}.npz", join(rows), evolution=bands)
     reporting.write_report(plan, tmp_path)
     text = (tmp_path / "REPORT.md").read_text()
-    assert text.count("| `mcl` |  |  | 2 | 100.0") == 2 and "Paired" not in text
+    # Three clips out of three: Wilson's interval of drives, however many runs there are.
+    low = 100 * binomtest(3, 3).proportion_ci(method="wilson").low
+    assert text.count(f"| `mcl` |  |  | 12 | 100.0 [{low:.1f}-100.0]") == 2
+    assert {"error_evolution.png", "position_error.png"} <= {path.name for path in (tmp_path / "hall").iterdir()}
     (tmp_path / "hall" / "mcl.json").write_text("[]")
     with pytest.raises(UserError, match=r"mcl\.json: not a result"):
         reporting.write_report(plan, tmp_path)
+
+
+def test_a_difference_of_three_clips_is_undecided_and_of_eight_not():
+    table = {}
+    for count in (3, 8):
+        for name, off in (("mcl", 1.5), ("pf_net", 0.2)):
+            parts = [measure_errors(off + 0.01 * np.ones((2, 9)), np.zeros((2, 9))) for _ in range(count)]
+            table[name] = join([run_rows(name, "global", clip, 0, runs) for clip, runs in enumerate(parts)])
+        both = join([table["pf_net"], table["mcl"]])
+        _, error = reporting.compare(both, Variant("pf_net"), Variant("mcl"), "global", 0)
+        # All signs agree: 2 / 2^clips.
+        assert error.p == pytest.approx(2 / 2**count) and error.estimate == pytest.approx(-1.3)
+        row = reporting.line(Variant("pf_net"), Variant("mcl"), "global", error)
+        assert row.endswith("| undecided |" if count == 3 else "| a better |")

@@ -7,16 +7,15 @@ import pytest
 
 from dsom_jax.errors import UserError
 from dsom_jax.judging import statistics as s
-from dsom_jax.judging.metrics import Runs
-from dsom_jax.judging.run_table import join, paired, run_rows
-from dsom_jax.report import read_runs, write_runs
+from dsom_jax.judging.metrics import Runs, summarize
+from dsom_jax.judging.run_table import join, paired, read_runs, run_rows, write_runs
 
 
 def runs_of(steps, e_pos) -> Runs:
     """A phase of as many runs; half of the ten updates after convergence stayed."""
     steps, zero = np.asarray(steps), np.zeros(len(steps))
     after = np.where(steps >= 0, 10, 0)
-    return Runs(steps, after, after // 2, steps < 0, np.asarray(e_pos, float), zero, zero + 20, zero, zero)
+    return Runs(steps, after, after // 2, steps < 0, np.asarray(e_pos, float), zero, zero + 20, zero, zero, zero, zero)
 
 
 def made_up(better=-0.1) -> tuple:
@@ -39,18 +38,18 @@ def test_from_runs_to_a_verdict(tmp_path):
     a, b = paired(read_runs(tmp_path / "runs.npz"), "a", "b", "global")
     assert (a.sequence == np.repeat(np.arange(8), 25)).all() and (a.run == np.tile(np.arange(25), 8)).all()
     assert a.method.tolist() == ["a"] * 200 and (np.isnan(a.retention) == ~a.converged).all()
-    family = s.corrected([
-        s.rate_evidence("converged", a.converged, b.converged, a.sequence),
-        s.value_evidence("E_pos, m", a.e_pos_m, b.e_pos_m, a.sequence),
-        s.value_evidence("retention", a.retention, b.retention, a.sequence, wanted="greater"),
-    ])  # fmt: skip
-    assert [e.status() for e in family] == ["supports", "supports", "undecided"]
-    assert s.signed_rank(a.converging_steps, b.converging_steps).pairs == (a.converged & b.converged).sum()
-    assert family[1].estimate == pytest.approx(-0.1, abs=0.01) and family[1].low < -0.1 < family[1].high
-    assert s.decide("a is better than b", family[:2]).outcome == "holds"
-    assert s.decide(
-        "b is better than a", [s.rate_evidence("converged", b.converged, a.converged, a.sequence)]
-    ).outcome == ("does not hold here")
+    pieces = [
+        s.paired_evidence("converged", a.converged, b.converged, a.sequence, "greater"),
+        s.paired_evidence("E_pos, m", a.e_pos_m, b.e_pos_m, a.sequence),
+        s.paired_evidence("retention", a.retention, b.retention, a.sequence, "greater"),
+    ]
+    assert [e.status() for e in pieces] == ["supports", "supports", "undecided"]
+    assert pieces[1].estimate == pytest.approx(-0.1, abs=0.01) and pieces[1].low < -0.1 < pieces[1].high
+    assert s.decide("a is better than b", pieces[:2]).outcome == "holds"
+    other = s.paired_evidence("converged", b.converged, a.converged, a.sequence, "greater")
+    assert s.decide("b is better than a", [other]).outcome == "does not hold here"
+    # The table holds all that a summary asks for.
+    assert summarize(a.runs)["retention"] == 0.5 and summarize(a.runs)["drives"] == 8
 
 
 def test_the_parts_of_a_sequence_are_paired_with_each_other():
@@ -64,7 +63,7 @@ def test_the_parts_of_a_sequence_are_paired_with_each_other():
     a, b = paired(table, "a", "b", "kidnap")
     assert a.part.tolist() == b.part.tolist() == [0, 0, 1, 1] and a.run.tolist() == b.run.tolist() == [0, 1, 0, 1]
     np.testing.assert_allclose(b.e_pos_m - a.e_pos_m, 0.5)
-    np.testing.assert_array_equal(a.converging_steps, [0, np.nan, 1, np.nan])
+    assert a.steps.tolist() == [0, -1, 1, -1]
     np.testing.assert_array_equal(a.retention, [0.5, np.nan, 0.5, np.nan])
     with pytest.raises(ValueError, match="phase global"):
         paired(table, "a", "b", "global")

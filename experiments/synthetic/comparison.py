@@ -16,7 +16,7 @@ from tables import bounds, markdown, number, percent
 from dsom_jax import bench, plotting
 from dsom_jax.filters.methods import METHODS, WEIGHT_POWER
 from dsom_jax.judging.metrics import STEP_BINS
-from dsom_jax.judging.run_table import RunTable, columns_of, from_columns, join
+from dsom_jax.judging.run_table import RunTable, join
 
 NAME = "comparison"
 PHASES = ("global", "kidnap")
@@ -50,8 +50,8 @@ def compare(name: str, config: Config, lab: Lab) -> dict[str, Any]:
     """One method on all sequences: its entry of ``bench.json``, every run, and E_pos over time."""
     settings = bench.Settings(config.runs, config.particles, config.t_cut, lab.seed, config.weight_power)
     entry, record = lab.compare(name, settings)
-    bands = [plotting.band_of(trace) for trace in record.traces]
-    return {"summary": entry, "runs": columns_of(record.table), "evolution": bands, "kidnapped": kidnappings(lab)}
+    bands = plotting.bands_of(record.traces)
+    return {"summary": entry, "runs": record.table, "evolution": bands, "kidnapped": kidnappings(lab)}
 
 
 def kidnappings(lab: Lab) -> list[list[int]]:
@@ -61,7 +61,7 @@ def kidnappings(lab: Lab) -> list[list[int]]:
 
 def table_of(results: Results, methods: Sequence[str]) -> RunTable:
     """All runs of ``methods``."""
-    return join([from_columns(name, results[name]["runs"]) for name in methods])
+    return join([results[name]["runs"] for name in methods])
 
 
 def errors_of(results: Results, methods: Sequence[str], which: str) -> dict[str, dict[str, np.ndarray]]:
@@ -132,13 +132,14 @@ Six sequences (two buildings that no training of DSOM saw, 20 unknown obstacles,
 kidnapping each), 200 particles, T_cut 0.6. PF-Net and PFRNN were trained in these two buildings, Mixture MCL's samples
 were collected in them, those of Mixture MCL* contain the test sequence. All but `robust_*` are judged by the weighted
 mean of the particles as in the paper, `robust_*` by the heaviest cluster. E_pos and E_theta: mean final error over
-converged runs [95 % bootstrap interval over runs]; whether the paper's means are over all runs it does not say. Its
+converged runs [95 % interval, by sequence]; whether the paper's means are over all runs it does not say. Its
 rows: Table II, and what can be read off its Fig 7, good to a few per cent. Kept: share of the updates after convergence
 within 2 m and 10 deg; strict: last estimate within 0.5 m and 5 deg.
 ms/update: all runs together."""
 
 FIGURES = """\
-Over time: mean over the runs of a sequence, shaded its 95 % bootstrap interval; below 2 m (and 10 deg) a run counts as
+Over time: mean over the runs of a sequence, shaded where 95 % of such means would lie (the luck of the runs, not of the
+drive); below 2 m (and 10 deg) a run counts as
 converged. Paper's comparison (its Fig 6 and 7):
 
 ![Final position errors](FIGURES/comparison_e_pos.png)

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from dsom_jax.bench import judged_by
 from dsom_jax.episode import Episode
 from dsom_jax.judging import metrics
+from dsom_jax.judging.scores import judged_by
 from dsom_jax.montecarlo import Result
 
 POOR = 0.1

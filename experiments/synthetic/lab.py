@@ -6,11 +6,13 @@ and the section of the report are made from what is kept, so that they can be dr
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import os
 import platform
 import time
+import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property, partial
@@ -22,11 +24,13 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from dsom_jax import bench, checkpoint, report
+from dsom_jax.atomic import write_atomic
 from dsom_jax.compiling import run_options
 from dsom_jax.data.suite import Suite, load_suite
 from dsom_jax.episode import Episode
 from dsom_jax.errors import UserError
 from dsom_jax.filters.methods import WEIGHT_POWER, build_filter, network_of, powers_of
+from dsom_jax.judging.run_table import RunTable, stored
 from dsom_jax.montecarlo import run_keys
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.run_folder import commit
@@ -212,17 +216,45 @@ def _cpuinfo() -> list[str]:
 
 
 def write(path: Path, data: dict[str, Any]) -> None:
-    """Strict JSON on as few lines as can be read, with six digits; NaN and infinities become null."""
-    report.write_rows(path, report.rounded(report.plain(data)))
+    """What a job gave: numbers as strict JSON on as few lines as can be read, with six digits, tables of runs and other
+    arrays in a compressed file beside it. NaN and infinities of JSON become null."""
+    arrays: dict[str, np.ndarray] = {}
+
+    def packed(value: Any, place: str) -> Any:
+        if isinstance(value, RunTable):
+            return {"table": [packed(column, f"{place}/{name}") and name for name, column in stored(value).items()]}
+        if isinstance(value, np.ndarray):
+            arrays[place] = value
+            return {"array": place}
+        return {key: packed(v, f"{place}/{key}") for key, v in value.items()} if isinstance(value, dict) else value
+
+    text = {key: packed(value, key) for key, value in data.items()}
+    if arrays:
+        buffer = io.BytesIO()
+        np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]  # allow_pickle is not among them
+        write_atomic(path.with_suffix(".npz"), buffer.getvalue())
+    report.write_rows(path, report.rounded(report.plain(text)))
 
 
 def read(path: Path) -> dict[str, Any]:
     """What :func:`write` wrote; UserError for anything else."""
     try:
         found: dict[str, Any] = json.loads(path.read_text())
-    except (OSError, ValueError):
+        beside = path.with_suffix(".npz")
+        arrays = dict(np.load(beside)) if beside.is_file() else {}
+
+        def unpacked(value: Any, place: str) -> Any:
+            if not isinstance(value, dict):
+                return value
+            if set(value) == {"table"}:
+                return RunTable(*(arrays[f"{place}/{name}"] for name in value["table"]))
+            if set(value) == {"array"}:
+                return arrays[value["array"]]
+            return {key: unpacked(v, f"{place}/{key}") for key, v in value.items()}
+
+        return {key: unpacked(value, key) for key, value in found.items()}
+    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile):
         raise UserError(f"{path}: not a result of these experiments; delete it and run again") from None
-    return found
 
 
 def result_path(folder: Path, piece: str, job: str) -> Path:

@@ -21,7 +21,7 @@ from dsom_jax import pose_grid as pg
 from dsom_jax.filters.methods import Settings, make_proposal
 from dsom_jax.geometry import transform_points
 from dsom_jax.judging import quality
-from dsom_jax.judging.statistics import clustered_bootstrap
+from dsom_jax.judging.statistics import interval, rate_interval
 from dsom_jax.lidar import LidarConfig, scan_points
 from dsom_jax.occupancy import OccupancyGrid, from_cells
 from dsom_jax.plotting.common import legend
@@ -138,11 +138,11 @@ def told(parts: list[tuple[np.ndarray, np.ndarray]], order: int) -> dict[str, An
         "peaks": peaks.tolist(),
         "world": world.tolist(),
         "exact": float(exact.mean()),
-        "exact_ci95": clustered_bootstrap(exact, world),
+        "exact_ci95": rate_interval(exact, world),
         "peaks_mean": float(peaks.mean()),
-        "peaks_ci95": clustered_bootstrap(peaks, world),
+        "peaks_ci95": interval(peaks, world),
         "all_found": float(all_found.mean()),
-        "all_found_ci95": clustered_bootstrap(all_found, world),
+        "all_found_ci95": rate_interval(all_found, world),
         "truth": float(mass[:, 0].mean()),
         "right": float(mass.sum(-1).mean()),
         "least": float(mass.min(-1).mean()),

@@ -17,7 +17,7 @@ from tables import markdown, percent
 
 from dsom_jax.filters.methods import DRAWN, Settings, make_proposal
 from dsom_jax.judging import metrics, quality
-from dsom_jax.judging.statistics import clustered_bootstrap
+from dsom_jax.judging.statistics import interval, rate_interval
 from dsom_jax.nn import DSOM
 from dsom_jax.plotting.common import legend
 from dsom_jax.types import Key
@@ -149,9 +149,9 @@ def told(parts: list[quality.Quality]) -> dict[str, Any]:
     joined = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
     return {
         **quality.totals(joined),
-        "mass_mean_ci95": clustered_bootstrap(mass, world),
-        "mass_gt_1pct_ci95": clustered_bootstrap(above, world),
-        "top1_ci95": clustered_bootstrap(top, world),
+        "mass_mean_ci95": interval(mass, world),
+        "mass_gt_1pct_ci95": rate_interval(above, world),
+        "top1_ci95": rate_interval(top, world),
         "top1_wilson95": metrics.wilson(float(top.mean()), len(top)),
     }
 

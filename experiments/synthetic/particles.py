@@ -12,7 +12,6 @@ from lab import POWERS, Everything, Lab, Piece
 from tables import bounds, markdown, number, percent
 
 from dsom_jax import bench
-from dsom_jax.judging.run_table import columns_of
 
 NAME = "particles"
 METHOD = "adam_dsom"
@@ -36,7 +35,7 @@ def jobs(config: Config) -> dict[str, Any]:
 def vary(count: int, config: Config, lab: Lab) -> dict[str, Any]:
     """AdaM + DSOM with ``count`` particles on all sequences."""
     entry, record = lab.compare(METHOD, bench.Settings(config.runs, count, config.t_cut, lab.seed))
-    return {"summary": entry, "runs": columns_of(record.table)}
+    return {"summary": entry, "runs": record.table}
 
 
 def by_count(everything: Everything) -> dict[int, dict[str, Any]]:

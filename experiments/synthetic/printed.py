@@ -12,7 +12,6 @@ from lab import Everything, Lab, Piece
 from tables import bounds, markdown, number, percent
 
 from dsom_jax import bench
-from dsom_jax.judging.run_table import columns_of
 
 NAME = "printed"
 
@@ -37,7 +36,7 @@ def run(name: str, config: Config, lab: Lab) -> dict[str, Any]:
     """One method on all sequences."""
     settings = bench.Settings(config.runs, config.particles, config.t_cut, lab.seed, config.weight_power)
     entry, record = lab.compare(name, settings)
-    return {"summary": entry, "runs": columns_of(record.table)}
+    return {"summary": entry, "runs": record.table}
 
 
 def section(everything: Everything) -> str:
@@ -59,7 +58,7 @@ def lines(everything: Everything) -> Iterator[list[str]]:
 
 def row(what: str, power: str, m: dict[str, Any]) -> list[str]:
     """One method in one phase with one power."""
-    soon = percent(m["steps_hist"]["0-20"] / m["experiments"])
+    soon = percent(m["within_20"])
     error = number(m["e_pos_m"], 3) + bounds(m["e_pos_ci95"], 1, 3)
     return [what, power, percent(m["converged"]), soon, error, percent(m["retention"]), percent(m["strict_success"])]
 

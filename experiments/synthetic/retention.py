@@ -16,11 +16,11 @@ from matplotlib.figure import Figure
 from side_by_side import other_t_cut, run_all
 from tables import bounds, markdown, number, percent
 
-from dsom_jax.bench import judge, judged_by
 from dsom_jax.episode import Episode
 from dsom_jax.filters.methods import COMBINATIONS
 from dsom_jax.judging import metrics, quality
-from dsom_jax.judging.run_table import RunTable, columns_of, join, run_rows
+from dsom_jax.judging.run_table import RunTable, join, run_rows
+from dsom_jax.judging.scores import answers, judge, judged_by
 from dsom_jax.montecarlo import run
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.plotting.common import legend, log_ticks
@@ -90,11 +90,12 @@ def told(parts: list[Part], t_cut: float | None) -> dict[str, Any]:
     found: list[RunTable] = []
     pooled: dict[str, list[metrics.Runs]] = {"global": [], "kidnap": []}
     for part in parts:
-        for phase, runs in judge(part.result, part.episode, judged_by(part.method)).items():
+        given = answers(part.result.info, judged_by(part.method))
+        for phase, runs in judge(given, part.episode, part.number).items():
             pooled[phase] += runs
             found += [run_rows(part.method, phase, part.number, n, some) for n, some in enumerate(runs)]
     summaries = {phase: metrics.summarize(metrics.pool(runs)) for phase, runs in pooled.items()}
-    return {"summary": summaries, "runs": columns_of(join(found)), "departures": departures(parts, t_cut)}
+    return {"summary": summaries, "runs": join(found), "departures": departures(parts, t_cut)}
 
 
 PHASES = {"global": "Global localization", "kidnap": "Kidnapping"}

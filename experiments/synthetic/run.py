@@ -3,7 +3,7 @@
 From the networks in ``checkpoints``, on two cores in three quarters of an hour; ``--runs 20`` is a look at all of it in
 less. What is timed has the machine for itself; after it, ``--workers`` processes share the rest. Every job writes
 ``results/PIECE.JOB.json``; what exists is kept, so that an interrupted run continues where it was, and a job that fails
-does not keep the others from being run. Figures (PNG and PDF) and ``experiments/REPORT.md`` are made from these files
+does not keep the others from being run. Figures and ``experiments/REPORT.md`` are made from these files
 at the end.
 """
 

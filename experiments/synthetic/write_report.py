@@ -51,8 +51,7 @@ def write(pieces: Sequence[Piece], results: Path, figures: Path, page: Path) -> 
     done = [piece for piece in pieces if piece.name in everything]
     for piece in done:
         for name, figure in piece.figures(everything).items():
-            for ending in ("png", "pdf"):
-                plotting.save(figure, figures / f"{name}.{ending}")
+            plotting.save_figure(figure, figures / f"{name}.png")
     text = render(done, everything)
     write_text(page, text.replace("FIGURES/", f"{os.path.relpath(figures, page.parent)}/"))
 

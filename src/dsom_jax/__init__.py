@@ -35,7 +35,7 @@ _PUBLIC = {
     "filters.updates": ("FilterConfig", "World"),
     "geometry": ("compose", "inverse", "relative", "transform_points", "wrap_angle"),
     "lidar": ("LidarConfig", "LidarNoise", "apply_limits", "observe", "scan_image", "scan_points"),
-    "judging.metrics": ("convergence_step", "measure", "pose_error", "retention", "summarize"),
+    "judging.metrics": ("measure", "pose_error", "retention", "summarize"),
     "montecarlo": ("run", "run_keys"),
     "motion": ("AdditiveMapFrame", "OdometryMotion", "OmniMotion"),
     "nn": (
@@ -51,6 +51,8 @@ _PUBLIC = {
     "proposals.uniform": ("FreeSpace", "free_space"),
     "raycast": ("MapTables", "RaycastConfig", "cast_rays", "make_tables"),
     "judging.run_table": ("RunTable", "paired"),
+    "judging.statistics": ("Decision", "Evidence", "decide", "evidence", "paired_evidence"),
+    "judging.trust": ("trust",),
     "sensor": (
         "BeamModel", "LikelihoodField", "ScoreModel", "beam_log_likelihood", "beam_score", "field_log_likelihood",
         "perfect_score",

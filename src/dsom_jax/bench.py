@@ -18,7 +18,8 @@ from dsom_jax.episode import Episode
 from dsom_jax.errors import UserError, run_cli
 from dsom_jax.filters.methods import METHODS, STANDARD, WEIGHT_POWER, build_filter, network_of
 from dsom_jax.judging import metrics
-from dsom_jax.judging.run_table import RunTable, join, run_rows
+from dsom_jax.judging.run_table import RunTable, join, run_rows, write_runs
+from dsom_jax.judging.scores import answers, judge, judged_by
 from dsom_jax.montecarlo import Result, run, run_keys, signature
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.trained import by_kind, check_networks, check_used, find_networks, load_networks
@@ -180,7 +181,7 @@ def run_method(name: str, suite: Suite, keys: Sequence[Key], build: Build, progr
         filter = filters[known] = filters.get(known) or build(name, where, grid, episode)
         result = clock.run(filter, episode, keys[number])
         for estimate, by_phase in parts.items():
-            for phase, runs in judge(result, episode, estimate).items():
+            for phase, runs in judge(answers(result.info, estimate), episode, number).items():
                 by_phase[phase] += runs
                 if estimate == judged_by(name):
                     rows += [run_rows(name, phase, number, part, some) for part, some in enumerate(runs)]
@@ -189,21 +190,6 @@ def run_method(name: str, suite: Suite, keys: Sequence[Key], build: Build, progr
         first = first or (filter, result)
     pooled = {e: {phase: metrics.pool(runs) for phase, runs in by.items()} for e, by in parts.items()}
     return Record(pooled, traces, clock.ms_per_step(), len(clock.compiled), join(rows), *first)
-
-
-def judge(result: Result, episode: Episode, estimate: str) -> dict[str, list[metrics.Runs]]:
-    """Metrics of each phase of one drive, from slices of the same runs; ``estimate`` is ``mean`` or ``cluster``."""
-    poses, lost, truth = (np.asarray(x) for x in (getattr(result.info, estimate), result.info.lost, episode.poses))
-    cuts = metrics.phases(episode.kidnapped)
-    return {
-        phase: [metrics.measure(poses[:, part], truth[part], lost[:, part]) for part in parts]
-        for phase, parts in cuts.items()
-    }
-
-
-def judged_by(method: str) -> str:
-    """The paper's filters answer with the weighted mean; ours with the heaviest cluster."""
-    return "cluster" if method.startswith("robust") else "mean"
 
 
 class Clock:
@@ -257,7 +243,7 @@ def summary(suite: Suite, records: dict[str, Record], settings: Settings) -> dic
             "methods": methods}  # fmt: skip
 
 
-def save(folder: Path, suite: Suite, records: dict[str, Record], data: dict[str, Any]) -> None:
+def write_results(folder: Path, suite: Suite, records: dict[str, Record], data: dict[str, Any]) -> None:
     """Write bench.json, bench.md and the figures."""
     report.write_json(folder / "bench.json", data)
     report.write_text(folder / "bench.md", report.markdown(data))
@@ -272,7 +258,7 @@ def save(folder: Path, suite: Suite, records: dict[str, Record], data: dict[str,
             grid, suite.lidar, episode, record.filter, moments(episode), record.result.kept.poses, estimates
         )
     for name, figure in figures.items():
-        plotting.save(figure, folder / f"{name}.png")
+        plotting.save_figure(figure, folder / f"{name}.png")
 
 
 def main() -> None:
@@ -294,9 +280,9 @@ def main() -> None:
     data = summary(suite, records, settings)
     report.print_tables(data)
     if folder:
-        save(folder, suite, records, data)
+        write_results(folder, suite, records, data)
     if folder and args.per_run:
-        report.write_runs(folder / "runs.npz", join([record.table for record in records.values()]))
+        write_runs(folder / "runs.npz", join([record.table for record in records.values()]))
 
 
 if __name__ == "__main__":

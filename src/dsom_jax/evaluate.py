@@ -184,13 +184,13 @@ def draw(
 ) -> None:
     """Calibration of all proposals; for the two that are worth it, the worst scans and the first ones."""
     curves = {name: quality.calibration(np.asarray(part.level)) for name, part in parts.items()}
-    plotting.save(plotting.calibration_curves(curves), folder / "calibration.png")
+    plotting.save_figure(plotting.calibration_curves(curves), folder / "calibration.png")
     for name in ("dsom", "likelihood_grid", "hybrid"):
         worst = np.argsort(parts[name].mass, kind="stable")[:WORST]
         for title, chosen in (("worst", worst), ("first", np.arange(min(WORST, len(parts[name].mass))))):
             views = [view(name, scenes, int(n), lidar, sources) for n in chosen]
             titles = [f"mass {100 * parts[name].mass[n]:.2g} %" for n in chosen]
-            plotting.save(plotting.map_views(views, titles), folder / f"{title}_{name}.png")
+            plotting.save_figure(plotting.map_views(views, titles), folder / f"{title}_{name}.png")
 
 
 def view(name: str, scenes: list[Scene], number: int, lidar: LidarConfig, sources: Sources) -> dict[str, Any]:

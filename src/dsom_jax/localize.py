@@ -24,7 +24,8 @@ from dsom_jax.data.log import limited
 from dsom_jax.errors import UserError, run_cli
 from dsom_jax.filters.methods import DRAWN, REAL, make_filter, make_proposal
 from dsom_jax.judging import metrics
-from dsom_jax.judging.scores import Drive, Outcome, save_estimate, scores
+from dsom_jax.judging.rooms import rooms_of
+from dsom_jax.judging.scores import Drive, Outcome, answers, judged_by, save_estimate, scores
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.montecarlo import run, run_keys
 from dsom_jax.occupancy import OccupancyGrid
@@ -117,7 +118,7 @@ def answer(args: Args, carried: Sequence[float] = ()) -> dict[str, Any]:
     with stage("expected ranges from every place of the map"):
         filter = jax.block_until_ready(build(args, grid, log.lidar, network))
     outcomes = localize(filter, each(drives, "segments"), args.runs, args.seed)
-    summary = summarize(outcomes, grid, args)
+    summary = summary_of(outcomes, grid, args)
     with stage("writing the page"):
         report.write_json(folder / "summary.json", summary)
         save_estimate(folder / "estimate.tum", outcomes)
@@ -243,7 +244,7 @@ def localize(filter: Filter, drives: Any, runs: int, seed: int) -> list[Outcome]
     return outcomes
 
 
-def summarize(outcomes: list[Outcome], grid: OccupancyGrid, args: Args) -> dict[str, Any]:
+def summary_of(outcomes: list[Outcome], grid: OccupancyGrid, args: Args) -> dict[str, Any]:
     """``summary.json``: the keys of DESIGN section 5 and, beside them, every segment on its own."""
     updates = sum(len(o.drive.stamps) for o in outcomes)
     timed = outcomes[1:] or outcomes
@@ -255,7 +256,8 @@ def summarize(outcomes: list[Outcome], grid: OccupancyGrid, args: Args) -> dict[
         "ms_per_update": 1e3 * float(np.median([o.seconds / len(o.drive.stamps) for o in timed])),
         "confident": float(np.mean([np.asarray(o.result.info.lost) < metrics.CONFIDENT for o in outcomes])),
     }  # fmt: skip
-    return head | scores(outcomes, grid, args.method, args.seed)
+    given = [answers(o.result.info, judged_by(args.method)) for o in outcomes]
+    return head | scores([o.drive for o in outcomes], given, grid, args.seed, rooms_of(grid))
 
 
 COLUMNS = (

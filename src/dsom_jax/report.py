@@ -10,23 +10,19 @@ Values that do not exist (a mean over no runs) are null. ``runs.npz`` (``--per-r
 
 from __future__ import annotations
 
-import io
 import json
 import math
 import tempfile
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rich import box
 from rich.console import Console
 from rich.table import Table
 
 from dsom_jax.atomic import write_atomic
 from dsom_jax.errors import UserError
-from dsom_jax.judging.run_table import RunTable
 
 PHASES = {"global": "Global localization", "kidnap": "Kidnapping"}
 
@@ -47,24 +43,6 @@ def output_folder(path: str | Path) -> Path:
 def write_text(path: Path, text: str) -> None:
     """Write ``path`` whole or not at all."""
     write_atomic(path, text.encode())
-
-
-def write_runs(path: Path, table: RunTable) -> None:
-    """Write the columns of ``table`` to ``path`` (npz), atomically."""
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, **table._asdict())
-    write_atomic(path, buffer.getvalue())
-
-
-def read_runs(path: str | Path) -> RunTable:
-    """The table that :func:`write_runs` wrote."""
-    try:
-        with np.load(path) as columns:
-            return RunTable(*(columns[name] for name in RunTable._fields))
-    except FileNotFoundError:
-        raise UserError(f"{path}: no such table of runs; make it with bench --per-run") from None
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
-        raise UserError(f"{path}: not a table of runs; make it again with bench --per-run") from None
 
 
 def write_json(path: Path, data: Any) -> None:
@@ -104,7 +82,7 @@ Cell = Callable[[dict[str, Any], float], str]
 """The text of a cell, from M and the milliseconds of a step."""
 COLUMNS: dict[str, Cell] = {
     "converged %": lambda m, _: _percent(m["converged"]) + _interval(m["converged_ci95"], 100),
-    "0-20 %": lambda m, _: _percent(_early(m)),
+    "0-20 %": lambda m, _: _percent(m["within_20"]),
     "steps": lambda m, _: _number(m["steps_median"], 0),
     "E_pos m": lambda m, _: _number(m["e_pos_m"], 3),
     "E_th rad": lambda m, _: _number(m["e_theta_rad"], 3),
@@ -113,7 +91,7 @@ COLUMNS: dict[str, Cell] = {
     "ms/step": lambda _, ms: _number(ms, 1),
 }
 LEGEND = """\
-converged: 5 updates in a row within 2 m and 10 deg [95 % interval]; 0-20: within 20 updates;
+converged: 5 updates in a row within 2 m and 10 deg [95 % interval, by drive]; 0-20: within 20 updates;
 steps: updates before converging, median; E: mean final error of the converged runs;
 kept: share of the later updates still within; strict: last estimate within 0.5 m and 5 deg;
 ms/step: one update of all runs together."""
@@ -175,11 +153,6 @@ def _cells(entry: dict[str, Any], phase: str, intervals: bool = False) -> list[s
         cells["E_pos m"] += _interval(entry[phase]["e_pos_ci95"], 1, 3)
         cells["E_th rad"] += _interval(entry[phase]["e_theta_ci95"], 1, 3)
     return list(cells.values())
-
-
-def _early(m: dict[str, Any]) -> float:
-    """Share of the runs that converged within 20 updates."""
-    return m["steps_hist"]["0-20"] / m["experiments"] if m["experiments"] else math.nan
 
 
 def _missing(value: float | None) -> bool:

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dsom_jax.geometry import wrap_angle
+from dsom_jax.judging.statistics import interval, rate_interval
 from dsom_jax.types import Array
 
 POSITION = 2.0
@@ -26,7 +27,7 @@ HOLD = 5
 """Consecutive updates that make a run converged."""
 STRICT_POSITION, STRICT_ANGLE = 0.5, math.radians(5)
 CONFIDENT = 0.05
-"""A filter whose lost probability is below this claims to know where it is."""
+"""A filter that says of itself no more than this probability of being lost claims to know where it is."""
 STEP_BINS = {"0-20": (0, 20), "20-40": (21, 40), "40-60": (41, 60), ">60": (61, math.inf)}
 """Converging steps of the paper's histogram, both ends included."""
 
@@ -35,12 +36,15 @@ class Runs(NamedTuple):
     """What one phase of R runs came to, one entry per run, (R,) each.
 
     Attributes:
-        steps: updates before convergence, -1 never (see :func:`convergence_step`).
+        steps: updates before the first of the HOLD that make a run converged, -1 never: 0 for a run that is right at
+            the very first update, and stays so.
         after: number of updates after convergence was established; ``stayed``: those of them inside the threshold.
         relost: converged, then outside for HOLD consecutive updates or at the last one.
         e_pos: metres at the last update; ``e_theta``: radians at the last update.
         known: number of updates with a reference; ``confident``: those at which the filter claimed to know, and
             ``fooled``: those at which it did and was wrong. NaN for filters that claim nothing.
+        metres: driven until convergence, by odometry; NaN where it never came, or the odometry is not known.
+        drive: number of the drive; its runs are not independent, and intervals are over drives.
     """
 
     steps: np.ndarray
@@ -52,6 +56,23 @@ class Runs(NamedTuple):
     known: np.ndarray
     confident: np.ndarray
     fooled: np.ndarray
+    metres: np.ndarray
+    drive: np.ndarray
+
+    @property
+    def converged(self) -> np.ndarray:
+        """(R,) bool."""
+        return self.steps >= 0
+
+    @property
+    def early(self) -> np.ndarray:
+        """(R,) bool, converged within 20 updates."""
+        return self.converged & (self.steps <= 20)
+
+    @property
+    def strict(self) -> np.ndarray:
+        """(R,) whether the last estimate is within 0.5 m and 5 deg."""
+        return (self.e_pos < STRICT_POSITION) & (self.e_theta < STRICT_ANGLE)
 
 
 def pose_error(estimate: Array, truth: Array) -> tuple[Array, Array]:
@@ -68,19 +89,6 @@ def pose_error(estimate: Array, truth: Array) -> tuple[Array, Array]:
     return jnp.where(valid, e_pos, missing), jnp.where(valid, e_theta, missing)
 
 
-def convergence_step(
-    e_pos: Any, e_theta: Any, pos: float = POSITION, theta: float = ANGLE, hold: int = HOLD
-) -> np.ndarray:
-    """STEPS: index of the first update of the first ``hold`` consecutive ones inside the threshold, -1 never.
-
-    Counts the updates before the estimate was right: a filter that is right at the very first update, and stays so,
-    takes 0 steps. Errors are (..., T) in metres and radians, the answer is (...).
-    """
-    e_pos, e_theta = np.asarray(e_pos), np.asarray(e_theta)
-    inside = (e_pos < pos) & (e_theta < theta)
-    return first_streak(inside, ~np.isnan(e_pos + e_theta), hold)[0]
-
-
 def first_streak(flags: np.ndarray, valid: np.ndarray, hold: int) -> tuple[np.ndarray, np.ndarray]:
     """First and last index of the first ``hold`` true ``flags`` in a row over the last axis, both -1 without one.
 
@@ -95,17 +103,21 @@ def first_streak(flags: np.ndarray, valid: np.ndarray, hold: int) -> tuple[np.nd
     return first, last
 
 
-def measure(estimates: Any, truth: Any, lost: Any = None) -> Runs:
-    """Judge R runs of one phase: estimates (R, T, 3), truth (T, 3), lost probabilities (R, T) or None."""
+def measure(estimates: Any, truth: Any, certain: Any = None, odometry: Any = None, drive: int = 0) -> Runs:
+    """Judge R runs of one phase of a drive: estimates (R, T, 3), truth (T, 3), odometry (T, 3).
+
+    ``certain`` (R, T) says at which updates the filter claims to know where it is; None for one that claims nothing.
+    """
     e_pos, e_theta = (np.asarray(e, np.float64) for e in pose_error(estimates, truth))
-    return measure_errors(e_pos, e_theta, lost)
+    return measure_errors(e_pos, e_theta, certain, odometry, drive)
 
 
-def measure_errors(e_pos: np.ndarray, e_theta: np.ndarray, lost: Any = None) -> Runs:
+def measure_errors(
+    e_pos: np.ndarray, e_theta: np.ndarray, certain: Any = None, odometry: Any = None, drive: int = 0
+) -> Runs:
     """As :func:`measure`, from errors (R, T); runs without any reference are dropped."""
     rows = ~np.isnan(e_pos).all(-1)
     e_pos, e_theta = e_pos[rows], e_theta[rows]
-    claims = np.full(e_pos.shape, np.nan) if lost is None else np.asarray(lost, np.float64)[rows]
     known = ~np.isnan(e_pos)
     inside = (e_pos < POSITION) & (e_theta < ANGLE)
     start, end = first_streak(inside, known, HOLD)
@@ -114,21 +126,18 @@ def measure_errors(e_pos: np.ndarray, e_theta: np.ndarray, lost: Any = None) -> 
     last = known.shape[-1] - 1 - np.argmax(known[:, ::-1], axis=-1)
     at_end = np.arange(len(last)), last
     relost = (first_streak(~inside, after, HOLD)[0] >= 0) | ((end >= 0) & ~inside[at_end])
-    confident, fooled = _claims(claims, known, inside)
+    nothing = np.full(len(last), np.nan)
+    claims = known & np.asarray(certain, bool)[rows] if certain is not None else None
+    confident, fooled = (nothing, nothing) if claims is None else (claims.sum(-1), (claims & ~inside).sum(-1))
+    metres = nothing if odometry is None else metres_travelled(start, odometry)
     return Runs(start, after.sum(-1), (after & inside).sum(-1), relost, e_pos[at_end], e_theta[at_end],
-                known.sum(-1), confident, fooled)  # fmt: skip
-
-
-def _claims(lost: np.ndarray, known: np.ndarray, inside: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(R,) updates at which the filter claims to know where it is, and those of them at which it errs."""
-    confident = known & (lost < CONFIDENT)
-    silent = np.isnan(lost).all(-1)
-    return np.where(silent, np.nan, confident.sum(-1)), np.where(silent, np.nan, (confident & ~inside).sum(-1))
+                known.sum(-1), confident, fooled, metres, np.full(len(last), drive))  # fmt: skip
 
 
 def pool(parts: Sequence[Runs]) -> Runs:
-    """The runs of several episodes as one set of experiments; none gives an empty set."""
-    parts = [*parts, Runs(*[np.zeros(0, kind) for kind in (int, int, int, bool, float, float, int, float, float)])]
+    """The runs of several drives, or parts of drives, as one set of experiments; none gives an empty set."""
+    kinds = (int, int, int, bool, float, float, int, float, float, float, int)
+    parts = [*parts, Runs(*[np.zeros(0, kind) for kind in kinds])]
     return Runs(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
@@ -146,25 +155,6 @@ def false_confident(runs: Runs) -> float:
 def ratio(part: float, whole: float) -> float:
     """part / whole, NaN when there is nothing to divide."""
     return float(part) / float(whole) if whole else math.nan
-
-
-def wilson(rate: float, n: float, z: float = 1.959963984540054) -> list[float]:
-    """Wilson score interval of a rate seen in ``n`` independent trials (95 % by default), [0, 1] without any."""
-    if not n or math.isnan(rate):
-        return [0.0, 1.0]
-    centre = rate + z * z / (2 * n)
-    half = z * math.sqrt(max(rate * (1 - rate), 0.0) / n + z * z / (4 * n * n))
-    scale = 1 + z * z / n
-    return [max(0.0, (centre - half) / scale), min(1.0, (centre + half) / scale)]
-
-
-def bootstrap(values: np.ndarray, seed: int = 0, resamples: int = 2000) -> list[float]:
-    """95 % percentile bootstrap interval of the mean of ``values`` (n,); NaN when there are none."""
-    if not len(values):
-        return [math.nan, math.nan]
-    rng = np.random.default_rng(seed)
-    means = [values[rng.integers(len(values), size=len(values))].mean() for _ in range(resamples)]
-    return [float(bound) for bound in np.percentile(means, [2.5, 97.5])]
 
 
 def phases(kidnapped: Any) -> dict[str, list[slice]]:
@@ -187,55 +177,45 @@ def metres_travelled(steps: np.ndarray, odometry: Any) -> np.ndarray:
 def summarize(runs: Runs, seed: int = 0) -> dict[str, Any]:
     """The numbers of a results table; rates are in [0, 1], NaN where there is nothing to average.
 
-    Final errors are those of the last update with a reference. Intervals (``_ci95``) are Wilson's for rates, with runs
-    as the trials (updates of one run are no independent trials), and a seeded bootstrap over runs for means.
+    Final errors are those of the last update with a reference. Intervals (``_ci95``) are by drive:
+    :func:`.statistics.rate_interval` for rates, :func:`.statistics.interval` for means.
     """
-    converged = runs.steps >= 0
-    return {
-        "experiments": len(runs.steps),
-        **_rate("converged", ratio(converged.sum(), len(converged)), len(converged)),
+    everyone, converged = np.ones(len(runs.steps)), runs.converged
+    claiming = ~np.isnan(runs.confident)
+    fooled, judged = np.where(claiming, runs.fooled, 0), np.where(claiming, runs.known, 0)
+    rates = {
+        "converged": (converged, everyone),
+        "within_20": (runs.early, everyone),
+        "retention": (runs.stayed, runs.after),
+        "re_loss": (runs.relost & converged, converged),
+        "strict_success": (runs.strict, everyone),
+        "false_confident": (fooled, judged),
+    }
+    means = {
+        "e_pos_m": ("e_pos_ci95", runs.e_pos, converged),
+        "e_theta_rad": ("e_theta_ci95", runs.e_theta, converged),
+        "final_e_pos_m_all": ("final_e_pos_all_ci95", runs.e_pos, everyone > 0),
+        "final_e_theta_rad_all": ("final_e_theta_all_ci95", runs.e_theta, everyone > 0),
+    }
+    found: dict[str, Any] = {"experiments": len(runs.steps), "drives": len(np.unique(runs.drive))}
+    for name, (part, whole) in rates.items():
+        found |= {name: ratio(part.sum(), whole.sum()), f"{name}_ci95": rate_interval(part, runs.drive, whole, seed)}
+    for name, (bounds, errors, rows) in means.items():
+        found |= {name: _mean(errors[rows]), bounds: interval(errors[rows], runs.drive[rows], seed=seed)}
+    return found | {
         "steps_median": _median(runs.steps[converged]),
         "steps_hist": steps_histogram(runs.steps),
-        **_rate("within_20", ratio((converged & (runs.steps <= 20)).sum(), len(converged)), len(converged)),
-        **_errors(runs, converged, seed),
-        **_rate("retention", retention(runs), (runs.after > 0).sum()),
-        **_rate("re_loss", ratio(runs.relost.sum(), converged.sum()), converged.sum()),
-        **_rate("strict_success", ratio(strict_success(runs).sum(), len(converged)), len(converged)),
-        **_rate("false_confident", false_confident(runs), (~np.isnan(runs.confident)).sum()),
-        "confident": ratio(np.nansum(runs.confident), runs.known[~np.isnan(runs.confident)].sum()),
+        "metres_median": _median(runs.metres[~np.isnan(runs.metres)]),
+        "e_pos_m_median": _median(runs.e_pos[converged]),
+        "e_theta_rad_median": _median(runs.e_theta[converged]),
+        "confident": ratio(np.where(claiming, runs.confident, 0).sum(), judged.sum()),
     }
-
-
-def strict_success(runs: Runs) -> np.ndarray:
-    """(R,) whether the last estimate is within 0.5 m and 5 deg."""
-    return (runs.e_pos < STRICT_POSITION) & (runs.e_theta < STRICT_ANGLE)
 
 
 def steps_histogram(steps: np.ndarray) -> dict[str, int]:
     """Counts of converging steps in the paper's four intervals, and of runs that never converged."""
     counts = {name: int(((steps >= low) & (steps <= high)).sum()) for name, (low, high) in STEP_BINS.items()}
     return counts | {"never": int((steps < 0).sum())}
-
-
-def _errors(runs: Runs, converged: np.ndarray, seed: int) -> dict[str, Any]:
-    """Final errors over converged runs, and over all of them."""
-    e_pos, e_theta = runs.e_pos[converged], runs.e_theta[converged]
-    return {
-        "e_pos_m": _mean(e_pos),
-        "e_pos_ci95": bootstrap(e_pos, seed),
-        "e_pos_m_median": _median(e_pos),
-        "e_theta_rad": _mean(e_theta),
-        "e_theta_ci95": bootstrap(e_theta, seed),
-        "e_theta_rad_median": _median(e_theta),
-        "final_e_pos_m_all": _mean(runs.e_pos),
-        "final_e_pos_all_ci95": bootstrap(runs.e_pos, seed),
-        "final_e_theta_rad_all": _mean(runs.e_theta),
-        "final_e_theta_all_ci95": bootstrap(runs.e_theta, seed),
-    }
-
-
-def _rate(name: str, rate: float, n: Any) -> dict[str, Any]:
-    return {name: float(rate), f"{name}_ci95": wilson(float(rate), float(n))}
 
 
 def _mean(values: np.ndarray) -> float:

@@ -1,24 +1,31 @@
-"""What every single run came to, so that methods can be compared run by run (:mod:`dsom_jax.judging.statistics`)."""
+"""What every single run came to, so that methods can be compared run by run (:mod:`.judging.statistics`)."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import io
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from dsom_jax.judging.metrics import Runs
+from dsom_jax.atomic import write_atomic
+from dsom_jax.errors import UserError
+from dsom_jax.judging.metrics import Runs, ratio
 
 
 class RunTable(NamedTuple):
-    """One row for each method, phase, sequence and run, (n,) each.
+    """One row for each method, phase, sequence and run, (n,) each; what follows ``run`` is as in :class:`Runs`.
 
     Attributes:
         method, phase: names, phase ``global`` or ``kidnap``.
         sequence, part, run: numbers from 0; ``part`` counts the kidnappings of a sequence.
         steps: updates before convergence, -1 never.
+        after, stayed: updates after convergence, and those of them inside the threshold; ``relost``: did not last.
         e_pos_m, e_theta_rad: error at the last update, metres and radians.
-        retention: share of the updates after convergence that stayed inside the threshold, NaN without any.
+        known, confident, fooled: updates with a reference, those with a claim, and with a wrong one.
+        metres: driven until convergence.
     """
 
     method: np.ndarray
@@ -27,9 +34,20 @@ class RunTable(NamedTuple):
     part: np.ndarray
     run: np.ndarray
     steps: np.ndarray
+    after: np.ndarray
+    stayed: np.ndarray
+    relost: np.ndarray
     e_pos_m: np.ndarray
     e_theta_rad: np.ndarray
-    retention: np.ndarray
+    known: np.ndarray
+    confident: np.ndarray
+    fooled: np.ndarray
+    metres: np.ndarray
+
+    @property
+    def runs(self) -> Runs:
+        """All rows as one set of experiments; sequences are the drives."""
+        return Runs(*self[5:], self.sequence)
 
     @property
     def converged(self) -> np.ndarray:
@@ -37,9 +55,9 @@ class RunTable(NamedTuple):
         return self.steps >= 0
 
     @property
-    def converging_steps(self) -> np.ndarray:
-        """(n,) steps as numbers to compare, NaN where the run never converged."""
-        return np.where(self.converged, self.steps, np.nan)
+    def retention(self) -> np.ndarray:
+        """(n,) share of the updates after convergence that stayed inside the threshold, NaN without any."""
+        return np.array([ratio(stayed, after) for stayed, after in zip(self.stayed, self.after, strict=True)])
 
     def rows(self, keep: Any) -> RunTable:
         """The rows ``keep`` (mask or indices)."""
@@ -49,29 +67,8 @@ class RunTable(NamedTuple):
 def run_rows(method: str, phase: str, sequence: int, part: int, runs: Runs) -> RunTable:
     """The runs of one method in one phase of one sequence."""
     count = len(runs.steps)
-    # 0 / 0 is asked for: a run that never converged has kept nothing and lost nothing.
-    with np.errstate(invalid="ignore"):
-        retention = np.asarray(runs.stayed, float) / runs.after
-    columns: list[np.ndarray] = [np.full(count, value) for value in (method, phase, sequence, part)]
-    columns += [np.arange(count), np.asarray(runs.steps, int), np.asarray(runs.e_pos), np.asarray(runs.e_theta)]
-    return RunTable(*[*columns, retention])
-
-
-COLUMNS = RunTable._fields[1:]
-"""What :func:`columns_of` keeps."""
-
-
-def columns_of(table: RunTable) -> dict[str, list[Any]]:
-    """The runs of one method as lists, without its name."""
-    return {name: getattr(table, name).tolist() for name in COLUMNS}
-
-
-def from_columns(method: str, kept: Mapping[str, Sequence[Any]]) -> RunTable:
-    """What :func:`columns_of` kept, as JSON has it: null is an infinite error, or a retention of NaN."""
-    missing = {"e_pos_m": np.inf, "e_theta_rad": np.inf, "retention": np.nan}
-    numbers = [np.array([other if v is None else v for v in kept[name]], float) for name, other in missing.items()]
-    integers = [np.array(kept[name], int) for name in ("sequence", "part", "run", "steps")]
-    return RunTable(np.full(len(kept["phase"]), method), np.array(kept["phase"]), *integers, *numbers)
+    labels = [np.full(count, value) for value in (method, phase, sequence, part)]
+    return RunTable(*[*labels, np.arange(count), *map(np.asarray, runs[:-1])])
 
 
 def join(tables: Sequence[RunTable]) -> RunTable:
@@ -92,3 +89,32 @@ def paired(table: RunTable, a: str, b: str, phase: str) -> tuple[RunTable, RunTa
     if keys[0].shape != keys[1].shape or (keys[0] != keys[1]).any():
         raise ValueError(f"{a} and {b} were not run on the same sequences and seeds; run them in one benchmark")
     return sides[0], sides[1]
+
+
+SMALL = {"sequence": np.int32, "part": np.int16, "run": np.int32, "steps": np.int32, "after": np.int32,
+         "stayed": np.int32, "known": np.int32, "e_pos_m": np.float32, "e_theta_rad": np.float32,
+         "confident": np.float32, "fooled": np.float32, "metres": np.float32}  # fmt: skip
+"""How columns lie in files."""
+
+
+def stored(table: RunTable) -> dict[str, np.ndarray]:
+    """The columns as they lie in files."""
+    return {name: column.astype(SMALL.get(name, column.dtype)) for name, column in table._asdict().items()}
+
+
+def write_runs(path: Path, table: RunTable, **more: np.ndarray) -> None:
+    """Write the columns of ``table``, and ``more`` arrays beside them, to ``path`` (npz), atomically."""
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **stored(table), **more)  # type: ignore[arg-type]  # allow_pickle is not among them
+    write_atomic(path, buffer.getvalue())
+
+
+def read_runs(path: str | Path) -> RunTable:
+    """The table that :func:`write_runs` wrote."""
+    try:
+        with np.load(path) as columns:
+            return RunTable(*(columns[name] for name in RunTable._fields))
+    except FileNotFoundError:
+        raise UserError(f"{path}: no such table of runs; make it with bench --per-run") from None
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        raise UserError(f"{path}: not a table of runs; make it again with bench --per-run") from None

@@ -1,16 +1,21 @@
-"""What the runs over the drives of a log came to, held against a reference."""
+"""What a system answered over drives, held against a reference: our filters and foreign localizers alike."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
 from dsom_jax.data import save_tum
 from dsom_jax.episode import Episode
 from dsom_jax.judging import metrics
+from dsom_jax.judging.rooms import Rooms, in_right_room
+from dsom_jax.judging.statistics import rate_interval
+from dsom_jax.judging.trust import trust
 from dsom_jax.montecarlo import Result
 from dsom_jax.occupancy import OccupancyGrid, is_free
 
@@ -30,53 +35,95 @@ class Outcome(NamedTuple):
     seconds: float
 
 
-def scores(outcomes: list[Outcome], grid: OccupancyGrid, method: str, seed: int) -> dict[str, Any]:
-    """Metrics of the start, of the kidnapping (``kidnap``) if there is one, and of every segment on its own."""
-    if all(np.isnan(o.drive.episode.poses).all() for o in outcomes):
+class Answers(NamedTuple):
+    """What was answered over one drive, R times.
+
+    Attributes:
+        poses: (R, T, 3) in the map frame; NaN where there was no answer, which is as wrong as can be.
+        p_lost: (R, T) probability that the pose is more than 2 m or 10 deg off, None from a system that says nothing.
+        certain: (R, T) bool, whether it claims to know where it is; None likewise.
+    """
+
+    poses: np.ndarray
+    p_lost: np.ndarray | None = None
+    certain: np.ndarray | None = None
+
+
+def answers(info: Any, estimate: str) -> Answers:
+    """Those of a filter by its diagnostics (leaves (R, T, ...)); ``estimate`` is ``mean`` or ``cluster``."""
+    p_lost = np.asarray(info.lost, np.float64)
+    poses = np.asarray(getattr(info, estimate))
+    return Answers(poses) if np.isnan(p_lost).all() else Answers(poses, p_lost, p_lost < metrics.CONFIDENT)
+
+
+def judged_by(method: str) -> str:
+    """The paper's filters answer with the weighted mean; ours (``robust_*``, ``adam_robust``) with the heaviest
+    cluster."""
+    return "cluster" if "robust" in method else "mean"
+
+
+def judge(answers: Answers, episode: Episode, drive: int = 0) -> dict[str, list[metrics.Runs]]:
+    """Metrics of each phase of one drive: ``global`` up to the first kidnapping, ``kidnap`` after every one."""
+    truth, odometry = np.asarray(episode.poses), np.asarray(episode.odometry)
+    certain = answers.certain
+    return {
+        phase: [
+            metrics.measure(answers.poses[:, part], truth[part], None if certain is None else certain[:, part],
+                            odometry[part], drive) for part in parts
+        ]
+        for phase, parts in metrics.phases(episode.kidnapped).items()
+    }  # fmt: skip
+
+
+def scores(
+    drives: Sequence[Drive], given: Sequence[Answers], grid: OccupancyGrid, seed: int = 0, rooms: Rooms | None = None
+) -> dict[str, Any]:
+    """Metrics of the start, of all kidnappings (``kidnap``) if there are any, and of every drive on its own.
+
+    ``right_room`` is the share of the updates in the right one of ``rooms``; ``p_lost`` says how good the probabilities
+    of being lost are (:func:`.trust.trust`), where the system gives any.
+    """
+    if all(np.isnan(drive.episode.poses).all() for drive in drives):
         return {"reference": None}
-    judged = [judge(outcome, method) for outcome in outcomes]
-    found = score(judged, "global", seed)
-    if "kidnap" in judged[0]:
-        found["kidnap"] = score(judged, "kidnap", seed)
-    return found | {"by_segment": [describe(o, j, grid) for o, j in zip(outcomes, judged, strict=True)]}
+    judged = [judge(a, d.episode, number) for number, (d, a) in enumerate(zip(drives, given, strict=True))]
+    pooled = {phase: metrics.pool([runs for j in judged for runs in j[phase]]) for phase in ("global", "kidnap")}
+    found = metrics.summarize(pooled["global"], seed)
+    if any(j["kidnap"] for j in judged):
+        found["kidnap"] = metrics.summarize(pooled["kidnap"], seed)
+    if rooms is not None:
+        found |= room_share(drives, given, rooms, seed)
+    if trusted := [judge_trust(d, a) for d, a in zip(drives, given, strict=True) if a.p_lost is not None]:
+        p_lost, wrong = (np.concatenate(column) for column in zip(*trusted, strict=True))
+        found["p_lost"] = trust(p_lost, wrong)
+    return found | {"by_segment": [describe(d, j["global"][0], grid) for d, j in zip(drives, judged, strict=True)]}
 
 
-def estimates(outcome: Outcome, method: str) -> np.ndarray:
-    """(R, T, 3) answers of a filter: the heaviest cluster, or for the paper's filters the weighted mean."""
-    info = outcome.result.info
-    return np.asarray(info.cluster if method == "adam_robust" else info.mean)
+def judge_trust(drive: Drive, given: Answers) -> tuple[np.ndarray, np.ndarray]:
+    """``p_lost`` and what was wrong (more than 2 m or 10 deg off) at all updates with a reference, flat."""
+    e_pos, e_theta = (np.asarray(e) for e in metrics.pose_error(jnp.asarray(given.poses), drive.episode.poses))
+    known = ~np.isnan(e_pos)
+    wrong = ~((e_pos < metrics.POSITION) & (e_theta < metrics.ANGLE))
+    return np.clip(np.asarray(given.p_lost)[known], 0.0, 1.0), wrong[known]
 
 
-def judge(outcome: Outcome, method: str) -> dict[str, tuple[metrics.Runs, np.ndarray]]:
-    """Metrics and metres driven until convergence (R,) of each phase."""
-    episode, poses = outcome.drive.episode, estimates(outcome, method)
-    truth, lost = np.asarray(episode.poses), np.asarray(outcome.result.info.lost)
-    judged = {}
-    for phase, parts in metrics.phases(episode.kidnapped).items():
-        for part in parts[:1]:
-            runs = metrics.measure(poses[:, part], truth[part], lost[:, part])
-            judged[phase] = runs, metrics.metres_travelled(runs.steps, np.asarray(episode.odometry)[part])
-    return judged
+def room_share(drives: Sequence[Drive], given: Sequence[Answers], rooms: Rooms, seed: int) -> dict[str, Any]:
+    """``right_room`` and its interval by drive; updates whose reference is in no room are passed over."""
+    counted = [in_right_room(rooms, a.poses, d.episode.poses) for d, a in zip(drives, given, strict=True)]
+    right, judged = (np.array([count[n] for count in counted], float) for n in (0, 1))
+    number = np.arange(len(drives))
+    return {"right_room": metrics.ratio(right.sum(), judged.sum()),
+            "right_room_ci95": rate_interval(right, number, judged, seed)}  # fmt: skip
 
 
-def score(judged: list[dict[str, tuple[metrics.Runs, np.ndarray]]], phase: str, seed: int) -> dict[str, Any]:
-    """All runs of one phase together."""
-    metres = np.concatenate([j[phase][1] for j in judged])
-    known = metres[~np.isnan(metres)]
-    median = float(np.median(known)) if len(known) else math.nan
-    return metrics.summarize(metrics.pool([j[phase][0] for j in judged]), seed) | {"metres_median": median}
-
-
-def describe(outcome: Outcome, judged: dict[str, Any], grid: OccupancyGrid) -> dict[str, Any]:
+def describe(drive: Drive, runs: metrics.Runs, grid: OccupancyGrid) -> dict[str, Any]:
     """One segment: where it starts in the log, how much of it lies on mapped free space, how often it succeeded."""
-    runs = judged["global"][0]
-    poses = outcome.drive.episode.poses
+    poses = drive.episode.poses
     known = ~np.isnan(np.asarray(poses)).any(-1)
     return {
-        "start_stamp": float(outcome.drive.stamps[0]),
+        "start_stamp": float(drive.stamps[0]),
         "on_map": float(np.asarray(is_free(grid, poses))[known].mean()) if known.any() else None,
-        "converged": metrics.ratio((runs.steps >= 0).sum(), len(runs.steps)),
-        "strict_success": metrics.ratio(metrics.strict_success(runs).sum(), len(runs.steps)),
+        "converged": metrics.ratio(runs.converged.sum(), len(runs.steps)),
+        "strict_success": metrics.ratio(runs.strict.sum(), len(runs.steps)),
         "e_pos_m_median": float(np.median(runs.e_pos)) if len(runs.e_pos) else math.nan,
     }
 

@@ -87,20 +87,38 @@ def step_bars(histograms: Mapping[str, Mapping[str, Mapping[str, int]]]) -> Figu
     return figure
 
 
-Band = Mapping[str, Any]
-"""``mean``, ``low`` and ``high`` (T,) of an error over the updates, NaN where the truth is unknown."""
+Band = np.ndarray
+"""(3, T) mean of an error over the updates and its band, low and high, NaN where the truth is unknown."""
 
 
 def error_evolution(traces: Sequence[Mapping[str, np.ndarray]], kidnapped: Sequence[Any]) -> Figure:
-    """Mean E_pos (metres) over the updates with its 95 % band: per episode {method: (R, T)} and kidnap flags (T,)."""
+    """Mean E_pos (metres) over the updates with its band: per episode {method: (R, T)} and kidnap flags (T,)."""
     bands = [{name: band_of(errors) for name, errors in by.items()} for by in traces]
     return band_evolution(bands, [np.flatnonzero(np.asarray(moved)).tolist() for moved in kidnapped])
 
 
 def band_of(errors: np.ndarray) -> Band:
-    """Mean of ``errors`` (R, T) over the runs at each update, with its bootstrap 95 % interval."""
-    mean, low, high = confidence_band(errors)
-    return {"mean": mean.tolist(), "low": low.tolist(), "high": high.tolist()}
+    """Mean of ``errors`` (R, T) over the runs of one drive at each update, and where 95 % of such means would lie.
+
+    That band is about the luck of the runs of this drive alone, and says nothing of other drives.
+    """
+    time = np.flatnonzero(~np.isnan(errors).all(0))
+    known = errors[:, time]
+    # An estimate that is no number is drawn as the worst error that was seen.
+    known = np.where(np.isfinite(known), known, np.max(known, initial=0.0, where=np.isfinite(known)))
+    runs = len(known)
+    draws = np.random.default_rng(0).multinomial(runs, np.full(runs, 1 / runs), size=500)
+    band = np.full((3, errors.shape[1]), np.nan)
+    band[:, time] = known.mean(0), *np.percentile(draws @ known / runs, [2.5, 97.5], axis=0)
+    return band
+
+
+def bands_of(traces: Sequence[np.ndarray]) -> np.ndarray:
+    """(S, 3, T) bands of the errors (R, T) of S drives, NaN behind the end of short ones; float32, to be kept."""
+    kept = np.full((len(traces), 3, max(trace.shape[1] for trace in traces)), np.nan, np.float32)
+    for band, trace in zip(kept, traces, strict=True):
+        band[:, : trace.shape[1]] = band_of(trace)
+    return kept
 
 
 def band_evolution(bands: Sequence[Mapping[str, Band]], kidnapped: Sequence[Sequence[int]]) -> Figure:
@@ -115,7 +133,7 @@ def band_evolution(bands: Sequence[Mapping[str, Band]], kidnapped: Sequence[Sequ
         for t in moved:
             ax.axvline(t, color="black", linestyle=":", linewidth=1, label="kidnapped")
         ax.axhline(2.0, color="0.5", linewidth=0.8, linestyle="--", label="2 m")
-        last = max((len(band["mean"]) for band in methods.values()), default=1) - 1
+        last = max((int(np.flatnonzero(~np.isnan(band[0])).max(initial=0)) for band in methods.values()), default=0)
         ax.set(yscale="log", xlabel="update", title=f"sequence {number + 1}", xlim=(0, last))
         _metre_ticks(ax)
     for ax in grid[:, 0]:
@@ -152,24 +170,10 @@ def calibration_curves(curves: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> F
     return figure
 
 
-def confidence_band(errors: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mean over runs (R, T) and its bootstrap 95 % interval, (T,) each; NaN where the reference is unknown."""
-    time = np.flatnonzero(~np.isnan(errors).all(0))
-    known = errors[:, time]
-    # An estimate that is no number is drawn as the worst error that was seen.
-    known = np.where(np.isfinite(known), known, np.max(known, initial=0.0, where=np.isfinite(known)))
-    runs = len(known)
-    draws = np.random.default_rng(0).multinomial(runs, np.full(runs, 1 / runs), size=500)
-    filled = np.full((3, errors.shape[1]), np.nan)
-    filled[:, time] = known.mean(0), *np.percentile(draws @ known / runs, [2.5, 97.5], axis=0)
-    return filled[0], filled[1], filled[2]
-
-
 def _band(ax: Axes, band: Band, color: str, label: str) -> None:
     """The mean and its band, where the reference is known."""
-    mean, low, high = (np.array(band[name], float) for name in ("mean", "low", "high"))
-    time = np.flatnonzero(~np.isnan(mean))
-    mean, low, high = (np.maximum(values[time], FLOOR) for values in (mean, low, high))
+    time = np.flatnonzero(~np.isnan(band[0]))
+    mean, low, high = np.maximum(band[:, time], FLOOR)
     ax.plot(time, mean, color=color, linewidth=1.4, label=label)
     ax.fill_between(time, low, high, color=color, alpha=0.2, linewidth=0)
 

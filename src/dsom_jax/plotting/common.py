@@ -14,11 +14,10 @@ from matplotlib.ticker import LogLocator, NullFormatter
 from dsom_jax.atomic import write_atomic
 
 
-def save(figure: Figure, path: Path) -> None:
-    """Write PNG at 150 dpi or PDF, as the ending of ``path`` says, whole or not at all, without a date."""
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a PNG at 110 dpi, whole or not at all."""
     buffer = io.BytesIO()
-    undated = {"CreationDate": None} if path.suffix == ".pdf" else None
-    figure.savefig(buffer, format=path.suffix[1:], dpi=150, metadata=undated)
+    figure.savefig(buffer, format="png", dpi=110)
     write_atomic(path, buffer.getvalue())
 
 

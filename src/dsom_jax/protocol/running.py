@@ -8,6 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from dsom_jax import bench, checkpoint, plotting, report
 from dsom_jax.data.suite import Suite
 from dsom_jax.episode import Episode
@@ -23,7 +25,8 @@ from dsom_jax.filters.methods import (
     network_of,
     powers_of,
 )
-from dsom_jax.judging.run_table import columns_of
+from dsom_jax.judging.run_table import RunTable, read_runs, write_runs
+from dsom_jax.judging.scores import judged_by
 from dsom_jax.montecarlo import run_keys
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.proposals.dual_features import with_episode
@@ -65,19 +68,16 @@ class Builder:
 def run_variant(
     variant: Variant, plan: Plan, suite: Suite, build: Builder, made_of: dict[str, Any], out: Path, work: Path
 ) -> None:
-    """One method on all clips: OUT/STEM.json, with what it is ``made_of`` and every run, and a picture in WORK."""
+    """One method on all clips: OUT/STEM.json, with what it is ``made_of``, every run in STEM.npz, a picture in WORK."""
     keys = [run_keys(plan.seed, number, plan.runs) for number in range(len(suite.episodes))]
     record = bench.run_method(variant.method, suite, keys, lambda _, __, grid, episode: build(variant, grid, episode))
     shared = bench.Settings(plan.runs, plan.particles, variant.t_cut or plan.t_cuts[0], plan.seed)
     entry = bench.summary(suite, {variant.method: record}, shared)["methods"][variant.method]
     draw(variant, suite, record, work)
-    entry |= {
-        "each_run": report.rounded(columns_of(record.table)),
-        "evolution": report.rounded([plotting.band_of(trace) for trace in record.traces]),
-    }
     facts = {"variant": variant.name, "t_cut": variant.t_cut, **made_of, "commit": build.commit}
     facts["network"] = network_facts(build.networks(variant), variant)
-    report.write_rows(out / f"{variant.stem}.json", facts | entry)
+    write_runs(out / f"{variant.stem}.npz", record.table, evolution=plotting.bands_of(record.traces))
+    report.write_json(out / f"{variant.stem}.json", facts | entry)
 
 
 def network_facts(folder: Path | None, variant: Variant) -> dict[str, Any] | None:
@@ -116,7 +116,20 @@ def trained_on(variant: Variant, plan: Plan) -> dict[str, Any]:
 def is_done(variant: Variant, made_of: dict[str, Any], out: Path) -> bool:
     """Whether the results of a variant are there with all runs, and :func:`identity` was the same."""
     found = read_entry(out, variant)
-    return found is not None and "each_run" in found and all(found.get(k) == value for k, value in made_of.items())
+    return (found is not None and (out / f"{variant.stem}.npz").is_file()
+            and all(found.get(k) == value for k, value in made_of.items()))  # fmt: skip
+
+
+def read_table(out: Path, variant: Variant) -> RunTable:
+    """Every run of a variant, under its name."""
+    table = read_runs(out / f"{variant.stem}.npz")
+    return table._replace(method=np.full(len(table.run), variant.stem))
+
+
+def read_evolution(out: Path, variant: Variant) -> np.ndarray:
+    """Bands of each clip (clips, 3, T), see :func:`.plotting.bands_of`."""
+    with np.load(out / f"{variant.stem}.npz") as kept:
+        return kept["evolution"]
 
 
 def read_entry(out: Path, variant: Variant) -> dict[str, Any] | None:
@@ -136,8 +149,8 @@ def read_entry(out: Path, variant: Variant) -> dict[str, Any] | None:
 def draw(variant: Variant, suite: Suite, record: bench.Record, work: Path) -> None:
     """Particles and PM of the first run of the first clip at four moments."""
     _, grid, episode = suite.episodes[0]
-    estimates = getattr(record.result.info, bench.judged_by(variant.method))[0]
+    estimates = getattr(record.result.info, judged_by(variant.method))[0]
     figure = plotting.moment_figure(
         grid, suite.lidar, episode, record.filter, bench.moments(episode), record.result.kept.poses, estimates
     )
-    plotting.save(figure, work / f"{variant.stem}.png")
+    plotting.save_figure(figure, work / f"{variant.stem}.png")

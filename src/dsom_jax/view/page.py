@@ -118,7 +118,7 @@ def _findings(story: Story) -> str:
         for finding in story.findings
     )
     none = "<p>Map and log gave no cause for remarks.</p>"
-    return f'<section><h2>Findings</h2>{f"<ul class=findings>{items}</ul>" if items else none}</section>'
+    return f"<section><h2>Findings</h2>{f'<ul class=findings>{items}</ul>' if items else none}</section>"
 
 
 def _numbers(title: str, numbers: dict[str, Any]) -> str:
