@@ -12,7 +12,7 @@ from dsom_jax.data import load_tum
 from dsom_jax.episode import Episode
 from dsom_jax.judging import scores as judging
 from dsom_jax.judging.rooms import rooms_of
-from dsom_jax.judging.scores import Answers, Drive, Outcome
+from dsom_jax.judging.scores import Drive, Outcome, Replies
 from dsom_jax.montecarlo import Result
 from dsom_jax.occupancy import from_cells
 
@@ -43,7 +43,7 @@ def outcome(late: tuple[int, int], start: float = 100.0, mean_off: float = 1.0, 
 
 
 def scored(*outcomes, method="adam_robust", seed=0):
-    given = [judging.answers(o.result.info, judging.judged_by(method)) for o in outcomes]
+    given = [judging.replies(o.result.info, judging.judged_by(method)) for o in outcomes]
     return judging.scores([o.drive for o in outcomes], given, GRID, seed, rooms_of(GRID))
 
 
@@ -70,7 +70,7 @@ def test_a_system_that_says_nothing_of_itself_is_judged_by_its_poses():
     one = outcome((0, 0))
     poses = np.asarray(one.result.info.cluster)[:1].copy()
     poses[0, :4] = np.nan  # no answer yet
-    found = judging.scores([one.drive], [Answers(poses)], GRID)
+    found = judging.scores([one.drive], [Replies(poses)], GRID)
     assert "p_lost" not in found and np.isnan(found["false_confident"]) and found["converged"] == 0
     assert found["kidnap"]["converged"] == 0.5 and "right_room" not in found
 

@@ -19,7 +19,7 @@ from dsom_jax.errors import UserError, run_cli
 from dsom_jax.filters.methods import METHODS, STANDARD, WEIGHT_POWER, build_filter, network_of
 from dsom_jax.judging import metrics
 from dsom_jax.judging.run_table import RunTable, join, run_rows, write_runs
-from dsom_jax.judging.scores import answers, judge, judged_by
+from dsom_jax.judging.scores import judge, judged_by, replies
 from dsom_jax.montecarlo import Result, run, run_keys, signature
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.trained import by_kind, check_networks, check_used, find_networks, load_networks
@@ -181,7 +181,7 @@ def run_method(name: str, suite: Suite, keys: Sequence[Key], build: Build, progr
         filter = filters[known] = filters.get(known) or build(name, where, grid, episode)
         result = clock.run(filter, episode, keys[number])
         for estimate, by_phase in parts.items():
-            for phase, runs in judge(answers(result.info, estimate), episode, number).items():
+            for phase, runs in judge(replies(result.info, estimate), episode, number).items():
                 by_phase[phase] += runs
                 if estimate == judged_by(name):
                     rows += [run_rows(name, phase, number, part, some) for part, some in enumerate(runs)]

@@ -25,7 +25,7 @@ from dsom_jax.errors import UserError, run_cli
 from dsom_jax.filters.methods import DRAWN, REAL, make_filter, make_proposal
 from dsom_jax.judging import metrics
 from dsom_jax.judging.rooms import rooms_of
-from dsom_jax.judging.scores import Drive, Outcome, answers, judged_by, save_estimate, scores
+from dsom_jax.judging.scores import Drive, Outcome, judged_by, replies, save_estimate, scores
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.montecarlo import run, run_keys
 from dsom_jax.occupancy import OccupancyGrid
@@ -256,7 +256,7 @@ def summary_of(outcomes: list[Outcome], grid: OccupancyGrid, args: Args) -> dict
         "ms_per_update": 1e3 * float(np.median([o.seconds / len(o.drive.stamps) for o in timed])),
         "confident": float(np.mean([np.asarray(o.result.info.lost) < metrics.CONFIDENT for o in outcomes])),
     }  # fmt: skip
-    given = [answers(o.result.info, judged_by(args.method)) for o in outcomes]
+    given = [replies(o.result.info, judged_by(args.method)) for o in outcomes]
     return head | scores([o.drive for o in outcomes], given, grid, args.seed, rooms_of(grid))
 
 

@@ -35,7 +35,7 @@ class Outcome(NamedTuple):
     seconds: float
 
 
-class Answers(NamedTuple):
+class Replies(NamedTuple):
     """What was answered over one drive, R times.
 
     Attributes:
@@ -49,11 +49,11 @@ class Answers(NamedTuple):
     certain: np.ndarray | None = None
 
 
-def answers(info: Any, estimate: str) -> Answers:
+def replies(info: Any, estimate: str) -> Replies:
     """Those of a filter by its diagnostics (leaves (R, T, ...)); ``estimate`` is ``mean`` or ``cluster``."""
     p_lost = np.asarray(info.lost, np.float64)
     poses = np.asarray(getattr(info, estimate))
-    return Answers(poses) if np.isnan(p_lost).all() else Answers(poses, p_lost, p_lost < metrics.CONFIDENT)
+    return Replies(poses) if np.isnan(p_lost).all() else Replies(poses, p_lost, p_lost < metrics.CONFIDENT)
 
 
 def judged_by(method: str) -> str:
@@ -62,13 +62,13 @@ def judged_by(method: str) -> str:
     return "cluster" if "robust" in method else "mean"
 
 
-def judge(answers: Answers, episode: Episode, drive: int = 0) -> dict[str, list[metrics.Runs]]:
+def judge(given: Replies, episode: Episode, drive: int = 0) -> dict[str, list[metrics.Runs]]:
     """Metrics of each phase of one drive: ``global`` up to the first kidnapping, ``kidnap`` after every one."""
     truth, odometry = np.asarray(episode.poses), np.asarray(episode.odometry)
-    certain = answers.certain
+    certain = given.certain
     return {
         phase: [
-            metrics.measure(answers.poses[:, part], truth[part], None if certain is None else certain[:, part],
+            metrics.measure(given.poses[:, part], truth[part], None if certain is None else certain[:, part],
                             odometry[part], drive) for part in parts
         ]
         for phase, parts in metrics.phases(episode.kidnapped).items()
@@ -76,7 +76,7 @@ def judge(answers: Answers, episode: Episode, drive: int = 0) -> dict[str, list[
 
 
 def scores(
-    drives: Sequence[Drive], given: Sequence[Answers], grid: OccupancyGrid, seed: int = 0, rooms: Rooms | None = None
+    drives: Sequence[Drive], given: Sequence[Replies], grid: OccupancyGrid, seed: int = 0, rooms: Rooms | None = None
 ) -> dict[str, Any]:
     """Metrics of the start, of all kidnappings (``kidnap``) if there are any, and of every drive on its own.
 
@@ -98,7 +98,7 @@ def scores(
     return found | {"by_segment": [describe(d, j["global"][0], grid) for d, j in zip(drives, judged, strict=True)]}
 
 
-def judge_trust(drive: Drive, given: Answers) -> tuple[np.ndarray, np.ndarray]:
+def judge_trust(drive: Drive, given: Replies) -> tuple[np.ndarray, np.ndarray]:
     """``p_lost`` and what was wrong (more than 2 m or 10 deg off) at all updates with a reference, flat."""
     e_pos, e_theta = (np.asarray(e) for e in metrics.pose_error(jnp.asarray(given.poses), drive.episode.poses))
     known = ~np.isnan(e_pos)
@@ -106,7 +106,7 @@ def judge_trust(drive: Drive, given: Answers) -> tuple[np.ndarray, np.ndarray]:
     return np.clip(np.asarray(given.p_lost)[known], 0.0, 1.0), wrong[known]
 
 
-def room_share(drives: Sequence[Drive], given: Sequence[Answers], rooms: Rooms, seed: int) -> dict[str, Any]:
+def room_share(drives: Sequence[Drive], given: Sequence[Replies], rooms: Rooms, seed: int) -> dict[str, Any]:
     """``right_room`` and its interval by drive; updates whose reference is in no room are passed over."""
     counted = [in_right_room(rooms, a.poses, d.episode.poses) for d, a in zip(drives, given, strict=True)]
     right, judged = (np.array([count[n] for count in counted], float) for n in (0, 1))

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from dsom_jax.judging.scores import Outcome, estimates
+from dsom_jax.judging.scores import Outcome, judged_by
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.occupancy import OccupancyGrid
-from dsom_jax.plotting import save
+from dsom_jax.plotting import save_figure
 from dsom_jax.view.answers import Answers, answers, write_answers
 from dsom_jax.view.page import shown, write_page
 from dsom_jax.view.picture import trajectory_figure
@@ -44,13 +44,14 @@ def write_view(
     said = [told(outcome, settings.method) for outcome in outcomes]
     story = tell(outcomes, said, grid, lidar, summary, notes, settings)
     write_answers(folder / "answers.csv", said)
-    save(trajectory_figure(story.plan, story.drives[0]), folder / "trajectory.png")
+    save_figure(trajectory_figure(story.plan, story.drives[0]), folder / "trajectory.png")
     write_page(folder / "report.html", story)
 
 
 def told(outcome: Outcome, method: str) -> Answers:
     """Answers of run 0 of a drive."""
-    return answers(outcome.drive.stamps, estimates(outcome, method), outcome.result.info, outcome.result.kept)
+    info = outcome.result.info
+    return answers(outcome.drive.stamps, np.asarray(getattr(info, judged_by(method))), info, outcome.result.kept)
 
 
 def tell(
