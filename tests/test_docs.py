@@ -29,7 +29,7 @@ PAPER = (ROOT / "docs" / "paper_to_code.md").read_text()
 LINK = re.compile(r"\[([^\]]*)\]\(([^)#\s]+)\)")
 COMMAND = re.compile(r"python -m dsom_jax\.(\w+) ([^`\n]*)")
 ARGUMENTS = {"bench": "Args", "localize": "Args", "train": "Arguments", "train_filter": "Arguments",
-             "evaluate": "Args"}  # fmt: skip
+             "evaluate": "Args", "export": "Args"}  # fmt: skip
 
 
 def marked(name: str) -> str:

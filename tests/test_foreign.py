@@ -89,7 +89,7 @@ def test_answers_too_late_or_missing_are_wrong(tmp_path):
 @pytest.mark.parametrize("words", [("amcl",), ("=x.tum",), ("amcl=",), ("amcl=nowhere.tum",), ("a={0}", "a={0}")])
 def test_external_needs_a_name_and_a_file(words, tmp_path):
     (tmp_path / "x.tum").touch()
-    with pytest.raises(UserError, match="--external .*NAME=FILE"):
+    with pytest.raises(UserError, match=r"--external .*NAME=FILE"):
         foreign.named([word.format(tmp_path / "x.tum") for word in words], "FILE.tum")
 
 
@@ -98,7 +98,7 @@ def test_localize_holds_all_against_both_references(tmp_path):
     suite = made_suite()
     drives = [Drive(d.episode, d.stamps + 100 * n) for n, d in enumerate(foreign.drives_of(suite))]
     stamps = np.concatenate([d.stamps for d in drives])
-    shifted = np.concatenate([np.asarray(d.episode.poses) for d in drives]) + [0.0, 3.0, 0.0]
+    shifted = np.concatenate([np.asarray(d.episode.poses) for d in drives]) + np.array([0.0, 3.0, 0.0])
     save_tum(tmp_path / "plan.tum", stamps, shifted)
     outcomes = []
     for d in drives:

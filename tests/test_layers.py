@@ -19,7 +19,20 @@ LAYERS = (
     ("filters", "training", "montecarlo", "ambiguity"),
     ("atomic", "data", "checkpoint", "run_folder", "trained", "plotting", "report", "judging", "view"),
     ("live",),
-    ("cli", "trainer", "train", "train_filter", "bench", "localize", "demo", "certify", "evaluate", "protocol", "ros2"),
+    (
+        "cli",
+        "trainer",
+        "train",
+        "train_filter",
+        "bench",
+        "localize",
+        "demo",
+        "certify",
+        "evaluate",
+        "export",
+        "protocol",
+        "ros2",
+    ),
 )
 DEVICE = 5
 """Layers below this are device code."""

@@ -18,8 +18,9 @@ from dsom_jax.episode import Episode
 from dsom_jax.errors import UserError, run_cli
 from dsom_jax.filters.methods import METHODS, STANDARD, WEIGHT_POWER, build_filter, network_of
 from dsom_jax.judging import metrics
+from dsom_jax.judging.foreign import drives_of, named, replies_of_suite
 from dsom_jax.judging.run_table import RunTable, join, run_rows, write_runs
-from dsom_jax.judging.scores import judge, judged_by, replies
+from dsom_jax.judging.scores import Replies, judge, judged_by, replies
 from dsom_jax.montecarlo import Result, run, run_keys, signature
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.trained import by_kind, check_networks, check_used, find_networks, load_networks
@@ -61,6 +62,8 @@ class Args:
     """Folder of a trained PF-Net; default: the one in the repository."""
     pfrnn: Path | None = None
     """Folder of a trained PFRNN; default: the one in the repository."""
+    external: tuple[str, ...] = ()
+    """NAME=DIR: another localizer's TUM trajectories of the exported suite, DIR/sequence-1.tum and so on."""
 
 
 @dataclass(frozen=True)
@@ -243,6 +246,16 @@ def summary(suite: Suite, records: dict[str, Record], settings: Settings) -> dic
             "methods": methods}  # fmt: skip
 
 
+def foreign(suite: Suite, given: Sequence[Replies], seed: int) -> dict[str, Any]:
+    """The entry of another localizer; what it took for an update it alone knows."""
+    drives = enumerate(episode for _, _, episode in suite.episodes)
+    judged = [judge(said, episode, number) for (number, episode), said in zip(drives, given, strict=True)]
+    pooled = {phase: metrics.pool([runs for j in judged for runs in j[phase]]) for phase in report.PHASES}
+    tables = {phase: metrics.summarize(runs, seed) for phase, runs in pooled.items()}
+    facts = {"ms_per_step": None, "compilations": 0, "estimate": "trajectory"}
+    return tables | facts | {"estimates": {"trajectory": tables}}
+
+
 def write_results(folder: Path, suite: Suite, records: dict[str, Record], data: dict[str, Any]) -> None:
     """Write bench.json, bench.md and the figures."""
     report.write_json(folder / "bench.json", data)
@@ -273,11 +286,14 @@ def main() -> None:
     check_used(asked, methods)
     suite = load_suite(args.suite)
     trained = load_networks(folders, methods, suite.lidar)
+    drives = drives_of(suite)
+    others = {name: replies_of_suite(where, drives) for name, where in named(args.external, "DIR").items()}
     folder = report.output_folder(args.out) if args.out else None
     bar, advance = progress_bar(len(methods) * len(suite.episodes))
     with bar:
         records = collect(suite, methods, settings, advance, trained)
     data = summary(suite, records, settings)
+    data["methods"] |= {name: foreign(suite, given, args.seed) for name, given in others.items()}
     report.print_tables(data)
     if folder:
         write_results(folder, suite, records, data)

@@ -15,7 +15,7 @@ from dsom_jax.ambiguity import AmbiguityConfig, Tried, log_odds, look_alikes, tr
 from dsom_jax.cli import each, parse, stage
 from dsom_jax.data import load_log, load_map
 from dsom_jax.errors import UserError, run_cli
-from dsom_jax.judging.metrics import wilson
+from dsom_jax.judging.statistics import rate_interval
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.view.certified import certificate, map_figure
@@ -63,7 +63,7 @@ def main() -> None:
     result, pairs = certify(tried, grid)
     with stage("writing the page"):
         report.write_json(folder / "certify.json", result)
-        plotting.save(map_figure(grid, tried, pairs), folder / "certify.png")
+        plotting.save_figure(map_figure(grid, tried, pairs), folder / "certify.png")
         write_page(folder / "report.html", certificate(args.map, grid, lidar, tried, result, pairs, asdict(args)))
     if args.json:
         print(json.dumps(report.plain(result), indent=2))
@@ -104,7 +104,9 @@ def certify(tried: Tried, grid: OccupancyGrid) -> tuple[dict[str, Any], list[Loo
     shares = {str(distance): float((metres <= distance).mean()) for distance in DISTANCES}
     return {
         "found_after_m": shares,
-        "found_after_m_ci95": {name: wilson(share, len(metres)) for name, share in shares.items()},
+        "found_after_m_ci95": {
+            str(distance): rate_interval(metres <= distance, np.arange(len(metres))) for distance in DISTANCES
+        },
         "metres_median": float(np.median(metres)),
         "look_alikes": [{"a": p.a, "b": p.b, "log_odds": p.log_odds} for p in pairs],
         "look_alikes_after_m": after,

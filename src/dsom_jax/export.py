@@ -16,6 +16,7 @@ from dsom_jax.episode import Episode
 from dsom_jax.errors import run_cli
 from dsom_jax.judging.foreign import stamps_of
 
+
 @dataclass(frozen=True)
 class Args:
     """Write a suite so that other localizers can be run on it: maps, and of each drive a bag and a reference."""
@@ -55,7 +56,9 @@ def main() -> None:
     args = parse(Args, "python -m dsom_jax.export")
     suite = load_suite(args.suite)
     write_suite(suite, report.output_folder(args.out))
-    print(f"{args.out}: {len(suite.episodes)} drives of {suite.name}; docs/compare.md says how to judge other localizers")
+    print(
+        f"{args.out}: {len(suite.episodes)} drives of {suite.name}; docs/compare.md says how to judge other localizers"
+    )
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -24,8 +24,9 @@ from dsom_jax.data.log import limited
 from dsom_jax.errors import UserError, run_cli
 from dsom_jax.filters.methods import DRAWN, REAL, make_filter, make_proposal
 from dsom_jax.judging import metrics
+from dsom_jax.judging.foreign import named, replies_of
 from dsom_jax.judging.rooms import rooms_of
-from dsom_jax.judging.scores import Drive, Outcome, judged_by, replies, save_estimate, scores
+from dsom_jax.judging.scores import Drive, Outcome, Replies, judged_by, replies, save_estimate, scores
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.montecarlo import run, run_keys
 from dsom_jax.occupancy import OccupancyGrid
@@ -43,6 +44,10 @@ class Args:
     """CARMEN (.log, .clf, .gz), rosbag1, rosbag2, mcap, or Rawseeds (*-SICK_FRONT.csv, or its folder)."""
     out: Path
     """Folder for report.html, trajectory.png, summary.json, answers.csv and estimate.tum."""
+    reference_on_plan: Path | None = None
+    """TUM trajectory carried over to a floor plan that is locally wrong; judged besides, as on_plan in summary.json."""
+    external: tuple[str, ...] = ()
+    """NAME=FILE.tum: another localizer's trajectory, judged alike, as external in summary.json."""
     reference: Path | None = None
     """TUM trajectory of the base in the map frame; default: the log's own, where it has one."""
     scan_topic: str | None = None
@@ -113,12 +118,14 @@ def answer(args: Args, carried: Sequence[float] = ()) -> dict[str, Any]:
     notes = [f"{file.name}: {line}" for file, report_of in reports for line in report_of.lines()]
     print("".join(f"{note}\n" for note in notes), end="", file=sys.stderr if args.json else sys.stdout)
     drives = [marked(drive, carried) for drive in cut(log, args)]
+    others = {name: replies_of(path, drives) for name, path in named(args.external, "FILE.tum").items()}
+    on_plan = carried_over(drives, args.reference_on_plan)
     network = load_network(args, log.lidar)
     folder = report.output_folder(args.out)
     with stage("expected ranges from every place of the map"):
         filter = jax.block_until_ready(build(args, grid, log.lidar, network))
     outcomes = localize(filter, each(drives, "segments"), args.runs, args.seed)
-    summary = summary_of(outcomes, grid, args)
+    summary = summary_of(outcomes, grid, args, on_plan, others)
     with stage("writing the page"):
         report.write_json(folder / "summary.json", summary)
         save_estimate(folder / "estimate.tum", outcomes)
@@ -244,8 +251,23 @@ def localize(filter: Filter, drives: Any, runs: int, seed: int) -> list[Outcome]
     return outcomes
 
 
-def summary_of(outcomes: list[Outcome], grid: OccupancyGrid, args: Args) -> dict[str, Any]:
-    """``summary.json``: the keys of DESIGN section 5 and, beside them, every segment on its own."""
+def carried_over(drives: list[Drive], reference: Path | None) -> list[Drive] | None:
+    """The drives with another reference, if there is one."""
+    if reference is None:
+        return None
+    poses = [given.poses[0] for given in replies_of(reference, drives)]
+    return [d._replace(episode=d.episode._replace(poses=jnp.asarray(p, jnp.float32)))
+            for d, p in zip(drives, poses, strict=True)]  # fmt: skip
+
+
+def summary_of(
+    outcomes: list[Outcome],
+    grid: OccupancyGrid,
+    args: Args,
+    on_plan: list[Drive] | None = None,
+    others: Mapping[str, list[Replies]] | None = None,
+) -> dict[str, Any]:
+    """``summary.json``: what was asked for, :func:`.scores.scores`, the same ``on_plan`` and of ``external`` ones."""
     updates = sum(len(o.drive.stamps) for o in outcomes)
     timed = outcomes[1:] or outcomes
     head = {
@@ -257,7 +279,14 @@ def summary_of(outcomes: list[Outcome], grid: OccupancyGrid, args: Args) -> dict
         "confident": float(np.mean([np.asarray(o.result.info.lost) < metrics.CONFIDENT for o in outcomes])),
     }  # fmt: skip
     given = [replies(o.result.info, judged_by(args.method)) for o in outcomes]
-    return head | scores([o.drive for o in outcomes], given, grid, args.seed, rooms_of(grid))
+    drives, rooms = [o.drive for o in outcomes], rooms_of(grid)
+
+    def judged(given: list[Replies]) -> dict[str, Any]:
+        found = scores(drives, given, grid, args.seed, rooms)
+        return found | ({"on_plan": scores(on_plan, given, grid, args.seed, rooms)} if on_plan else {})
+
+    external = {name: judged(theirs) for name, theirs in (others or {}).items()}
+    return head | judged(given) | ({"external": external} if external else {})
 
 
 COLUMNS = (
@@ -276,8 +305,12 @@ def print_summary(summary: dict[str, Any], folder: Path) -> None:
         table.add_column("")
         for head, _, _ in COLUMNS:
             table.add_column(head, justify="right")
-        for name, part in (("start anywhere", summary), ("carried away", summary.get("kidnap"))):
-            if part:
+        parts = [("start anywhere", summary), ("carried away", summary.get("kidnap"))]
+        parts += [("on the plan", summary.get("on_plan"))]
+        for name, theirs in summary.get("external", {}).items():
+            parts += [(name, theirs), (f"{name}, carried away", theirs.get("kidnap"))]
+        for name, part in parts:
+            if part and "converged" in part:
                 table.add_row(name, *(_cell(part[key], text) for _, key, text in COLUMNS))
         console.print(table)
     else:

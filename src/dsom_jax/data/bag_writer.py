@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,11 @@ from dsom_jax.errors import UserError
 BASE, LASER, ODOM = "base_link", "laser", "odom"
 
 
-def write_bag(path: Path, log: RawLog) -> None:
-    """Write ``log`` as a rosbag2 folder ``path`` (mcap): /scan, /odom and /tf_static; an older one is replaced."""
+def write_bag(path: Path, log: RawLog, moving_frames: bool = False) -> None:
+    """Write ``log`` as a rosbag2 folder ``path`` (mcap): /scan, /odom and /tf_static; an older one is replaced.
+
+    With ``moving_frames`` also /tf from odom to base_link, which other localizers listen to.
+    """
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
 
@@ -25,16 +29,20 @@ def write_bag(path: Path, log: RawLog) -> None:
         shutil.rmtree(draft, ignore_errors=True)
         with Writer(draft, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
             parts = (("/tf_static", "tf2_msgs/msg/TFMessage"), ("/odom", "nav_msgs/msg/Odometry"),
-                     ("/scan", "sensor_msgs/msg/LaserScan"))  # fmt: skip
+                     ("/scan", "sensor_msgs/msg/LaserScan"),
+                     *([("/tf", "tf2_msgs/msg/TFMessage")] if moving_frames else []))  # fmt: skip
             at = {topic: writer.add_connection(topic, kind, typestore=messages.store) for topic, kind in parts}
 
             def write(topic: str, stamp: float, message: Any) -> None:
                 content = messages.store.serialize_cdr(message, message.__msgtype__)
                 writer.write(at[topic], round(stamp * 1e9), content)
 
-            write("/tf_static", float(log.stamps[0]), messages.mount(float(log.stamps[0]), log.lidar.mount))
+            first = float(log.stamps[0])
+            write("/tf_static", first, messages.frame(first, BASE, LASER, log.lidar.mount))
             for stamp, pose in zip(*odometry_at_rate(log.stamps, log.odometry), strict=True):
                 write("/odom", float(stamp), messages.odometry(float(stamp), pose.tolist()))
+                if moving_frames:
+                    write("/tf", float(stamp), messages.frame(float(stamp), ODOM, BASE, pose.tolist()))
             for stamp, scan in zip(log.stamps.tolist(), log.ranges, strict=True):
                 write("/scan", stamp, messages.scan(stamp, scan, log))
         shutil.rmtree(path, ignore_errors=True)
@@ -78,15 +86,13 @@ class _Messages:
     def _vector(self, x: float = 0.0, y: float = 0.0) -> Any:
         return self._make("geometry_msgs/msg/Vector3", x=x, y=y, z=0.0)
 
-    def mount(self, stamp: float, mount: tuple[float, float, float]) -> Any:
-        """Where the laser sits on the base."""
-        x, y, yaw = mount
-        transform = self._make(
-            "geometry_msgs/msg/Transform", translation=self._vector(x, y), rotation=self._turn(yaw)
-        )
-        header = self._header(stamp, BASE)
+    def frame(self, stamp: float, parent: str, child: str, pose: Sequence[float]) -> Any:
+        """Where ``child`` is in ``parent``: (x, y, yaw)."""
+        x, y, yaw = pose
+        transform = self._make("geometry_msgs/msg/Transform", translation=self._vector(x, y), rotation=self._turn(yaw))
+        header = self._header(stamp, parent)
         stamped = self._make(
-            "geometry_msgs/msg/TransformStamped", header=header, child_frame_id=LASER, transform=transform
+            "geometry_msgs/msg/TransformStamped", header=header, child_frame_id=child, transform=transform
         )
         return self._make("tf2_msgs/msg/TFMessage", transforms=[stamped])
 

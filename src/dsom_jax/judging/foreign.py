@@ -65,6 +65,8 @@ def replies_of_suite(folder: Path, drives: Sequence[Drive]) -> list[Replies]:
         one, several = folder / f"sequence-{number}.tum", folder / f"sequence-{number}"
         paths = [one] if one.is_file() else sorted(several.glob("*.tum"))
         if not paths:
-            raise UserError(f"{folder}: has neither {one.name} nor TUM files in {several.name}/; give one of each drive")
+            raise UserError(
+                f"{folder}: has neither {one.name} nor TUM files in {several.name}/; give one of each drive"
+            )
         found.append(Replies(np.concatenate([replies_of(path, [drive])[0].poses for path in paths])))
     return found
