@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from dsom_jax.data import se2
 from dsom_jax.data.carmen import load_carmen
-from dsom_jax.data.carmen_lidar import detect_no_return
+from dsom_jax.data.range_codes import detect_no_return
 from dsom_jax.errors import UserError
 
 

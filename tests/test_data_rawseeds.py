@@ -9,7 +9,7 @@ import math
 import numpy as np
 import pytest
 
-from dsom_jax.data import load_log, load_rawseeds, save_tum, se2
+from dsom_jax.data import LogOptions, load_log, load_rawseeds, save_tum, se2
 from dsom_jax.errors import UserError
 
 SESSION, START, BEAMS, SCANS = "Bicocca_2009-02-25b", 1235603336.3, 181, 12
@@ -93,11 +93,13 @@ def test_the_rear_laser_looks_back(folder):
     assert log.ranges[0, 0] == np.float32(3.0)
 
 
-def test_the_mount_is_a_parameter_and_meta_yaml_has_the_last_word(folder):
-    assert load_rawseeds(folder, mount=(0.2, 0.1, 0.05)).lidar.mount == (0.2, 0.1, 0.05)
+def test_the_mount_is_an_option_and_meta_yaml_has_the_next_word(folder):
+    options = LogOptions(mount="0.2,0.1,0.05")
+    assert load_rawseeds(folder, options).lidar.mount == (0.2, 0.1, 0.05)
     (folder / "meta.yaml").write_text("mount: [0.1, 0.0, 0.5]\nangle_min: -1.5\nrange_no_return: 30.0\n")
-    lidar = load_rawseeds(folder, mount=(0.2, 0.1, 0.05)).lidar
+    lidar = load_rawseeds(folder).lidar
     assert (lidar.mount, lidar.angle_min, lidar.range_max) == ((0.1, 0.0, 0.5), -1.5, 30.0)
+    assert load_rawseeds(folder, options).lidar.mount == (0.2, 0.1, 0.05)
 
 
 def test_the_angular_offset_turns_the_scan_and_the_odd_one_is_dropped(folder):

@@ -7,8 +7,8 @@ import pytest
 
 from data_dir import real_data
 from dsom_jax.data import load_log, load_ros_map, load_tum, se2, segments, thin
-from dsom_jax.data.carmen_lidar import detect_no_return
 from dsom_jax.data.log import travelled
+from dsom_jax.data.range_codes import detect_no_return
 from dsom_jax.occupancy import is_free
 
 # Scans, beams, updates after thinning at 0.25 m and 0.2 rad, metres of odometry, where no-return begins.

@@ -19,6 +19,7 @@ import tyro
 
 import dsom_jax
 import tiny_world
+from dsom_jax.data import LogOptions
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.raycast import cast_rays
 
@@ -132,7 +133,7 @@ def test_commands_of_the_pages_are_understood(page):
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_options_named_in_the_pages_exist(page):
-    known = {f"--{f.name.replace('_', '-')}" for module in ARGUMENTS for f in fields(arguments(module))}
+    known = {f"--{f.name.replace('_', '-')}" for kind in [*map(arguments, ARGUMENTS), LogOptions] for f in fields(kind)}
     for option in re.findall(r"(?<![\w-])--[a-z][a-z-]*", page.read_text()):
         assert option in known | {"--help"}, f"{page.name}: {option}"
 

@@ -145,7 +145,7 @@ def test_localize_takes_the_laser_that_is_named(upo, monkeypatch, tmp_path):
         (("--map", "spoilt.yaml"), ["spoilt.yaml", "unknown field scale"]),
         (("--log", f"{SESSION}-SICK_REAR.csv"), ["SICK_REAR.csv", "no such"]),
         (("--log", f"{SESSION}-GT-extended.csv"), ["GT-extended.csv", "SICK_FRONT.csv"]),
-        (("--log", "two.bag"), ["two.bag", "scan_topic", "/scanback, /scanfront"]),
+        (("--log", "two.bag"), ["two.bag", "--scan-topic", "/scanback, /scanfront"]),
     ],
 )
 def test_bad_input_is_one_line(bicocca, upo, monkeypatch, tmp_path, capfd, words, fragments):

@@ -8,19 +8,20 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import tyro
 from rich import box
 from rich.table import Table
 
 from dsom_jax import checkpoint, report
 from dsom_jax.cli import each, parse, stage
-from dsom_jax.data import RawLog, Report, load_log, load_map
+from dsom_jax.data import LogOptions, RawLog, Report, load_log, load_map
 from dsom_jax.data.cut import segment_indices, splice, to_episode, without_repeats
-from dsom_jax.data.log import limited
+from dsom_jax.data.log import STILL, limited
 from dsom_jax.errors import UserError, run_cli
 from dsom_jax.filters.methods import DRAWN, REAL, make_filter, make_proposal
 from dsom_jax.judging import metrics
@@ -39,7 +40,7 @@ class Args:
     """Cut a log into segments, start each without any prior, and tell how often the robot is found."""
 
     map: Path
-    """ROS map_server YAML, a DXF drawing, or a YAML with `drawing: FILE.dxf` and how to read it."""
+    """ROS map_server YAML, a bag with /map, a DXF drawing, or a YAML with `drawing: FILE.dxf` and how to read it."""
     log: Path
     """CARMEN (.log, .clf, .gz), rosbag1, rosbag2, mcap, or Rawseeds (*-SICK_FRONT.csv, or its folder)."""
     out: Path
@@ -50,10 +51,8 @@ class Args:
     """NAME=FILE.tum: another localizer's trajectory, judged alike, as external in summary.json."""
     reference: Path | None = None
     """TUM trajectory of the base in the map frame; default: the log's own, where it has one."""
-    scan_topic: str | None = None
-    """LaserScan of a bag that has several."""
-    odom_topic: str | None = None
-    """Odometry of a bag that has several."""
+    reading: Annotated[LogOptions, tyro.conf.arg(name="")] = LogOptions()
+    """What the log does not say, or says wrongly; topics and frames are those of bags."""
     method: Literal["adam_robust", "adam", "mcl", "mixture_mcl"] = "adam_robust"
     """Particle filter."""
     proposal: Literal["likelihood_grid", "dsom", "hybrid", "uniform", "dual_features"] = "likelihood_grid"
@@ -112,7 +111,7 @@ def answer(args: Args, carried: Sequence[float] = ()) -> dict[str, Any]:
     """
     left_out = Report()
     grid = load_map(args.map, left_out)
-    log = load_log(args.log, reference=args.reference, scan_topic=args.scan_topic, odom_topic=args.odom_topic)
+    log = load_log(args.log, args.reading, reference=args.reference)
     log = limited(log, args.laser_max_range)
     reports = ((args.map, left_out), (args.log, log.report))
     notes = [f"{file.name}: {line}" for file, report_of in reports for line in report_of.lines()]
@@ -175,6 +174,8 @@ def cut(log: RawLog, args: Args) -> list[Drive]:
     """Segments of the log; with ``--kidnap`` each is followed by the one half the log further."""
     rows = segment_indices(log, args.segments, args.steps_per_segment or None, args.update_min_d, args.update_min_a)
     if rows.shape[1] < metrics.HOLD + 1:
+        if still := next((line for line in log.report.lines() if STILL in line), None):
+            raise UserError(f"{log.path}: no updates to judge: {still}, or give a log of a drive")
         raise UserError(
             f"{log.path}: segments of {rows.shape[1]} updates are too short to judge, need {metrics.HOLD + 1}; "
             "give a longer log, fewer --segments or smaller --update-min-d and --update-min-a"

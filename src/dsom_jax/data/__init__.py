@@ -5,6 +5,7 @@ from dsom_jax.data.carmen import load_carmen
 from dsom_jax.data.cut import segment_indices, segments, splice, thin, to_episode
 from dsom_jax.data.dxf import Drawing, load_drawing
 from dsom_jax.data.log import RawLog, Report, check_lidar
+from dsom_jax.data.log_options import LogOptions
 from dsom_jax.data.open_log import load_log
 from dsom_jax.data.open_map import load_map
 from dsom_jax.data.rawseeds import load_rawseeds
@@ -13,6 +14,7 @@ from dsom_jax.data.trajectory import Trajectory, associate, load_tum, save_tum, 
 
 __all__ = [
     "Drawing",
+    "LogOptions",
     "RawLog",
     "Report",
     "Trajectory",

@@ -28,7 +28,8 @@ from dsom_jax.data import se2
 from dsom_jax.data.carmen_lidar import LaserConfig, guess_config, lidar_of
 from dsom_jax.data.files import read_lines
 from dsom_jax.data.log import RawLog, Report, limit_ranges, majority_beams, rigid_mount, tidy
-from dsom_jax.data.odometry import odometry_at
+from dsom_jax.data.log_options import AS_TOLD, LogOptions
+from dsom_jax.data.odometry import mended, odometry_at
 from dsom_jax.errors import UserError
 
 WITH_POSE = ("FLASER", "ROBOTLASER1")
@@ -49,11 +50,11 @@ class Messages:
     report: Report = field(default_factory=Report)
 
 
-def load_carmen(path: str | Path, range_max: float | None = None) -> RawLog:
+def load_carmen(path: str | Path, options: LogOptions = AS_TOLD, range_max: float | None = None) -> RawLog:
     """Scans, odometry and, where the log holds one, the reference of a ``.log``, ``.clf`` or ``.gz`` file.
 
     Readings from ``range_max`` metres on are no returns. Without it the value comes from ``meta.yaml`` beside the log,
-    from the log's own messages, or is detected (see :func:`dsom_jax.data.carmen_lidar.detect_no_return`).
+    from the log's own messages, or is detected (see :func:`dsom_jax.data.range_codes.detect_no_return`).
     """
     path = Path(path)
     messages = parse(read_lines(path, "log"))
@@ -67,7 +68,7 @@ def load_carmen(path: str | Path, range_max: float | None = None) -> RawLog:
     stamps = np.array(messages.stamps)[keep]
     config = next(c for c, kept in zip(messages.configs, keep, strict=True) if kept)
     odometry, mount, reference = _poses(messages, keep, stamps, path)
-    lidar = lidar_of(path, ranges, config, messages.params, mount, range_max)
+    lidar = options.mounted(lidar_of(path, ranges, config, messages.params, mount, range_max))
     if reference is not None:
         reference = se2.compose(reference, se2.inverse(np.array(lidar.mount)))
     ranges = limit_ranges(ranges, lidar.range_min, lidar.range_max)
@@ -147,8 +148,20 @@ def _poses(
     poses = np.array(messages.poses)[keep]
     if np.isfinite(poses).all():
         laser, odometry = poses[:, :3], poses[:, 3:]
+        if (laser == odometry).all() and len(poses) > 20:
+            kind = "scans whose pose of the laser is that of the odometry, word for word"
+            messages.report.add(f"{kind}: if a SLAM program wrote the log, the odometry is corrected", count=len(poses))
         mount = rigid_mount(odometry, laser)
-        return odometry, mount, laser if mount is None else None
+        return _without_jumps(odometry, stamps, messages.report), mount, laser if mount is None else None
     if len(messages.odometry) < 2:
-        raise UserError(f"{path}: neither its laser messages nor ODOM lines give odometry; give a log with both")
+        fix = "record FLASER or ODOM lines too, or make odometry from the scans"
+        raise UserError(f"{path}: neither its laser messages nor ODOM lines give odometry; {fix}")
     return odometry_at(np.array(messages.odometry), stamps, messages.report), None, None
+
+
+def _without_jumps(odometry: np.ndarray, stamps: np.ndarray, report: Report) -> np.ndarray:
+    """Odometry (N, 3) of the scans as it is, or if it jumps, with no motion across the jumps."""
+    rows = mended(np.column_stack([stamps, odometry]), report)
+    if not len(rows.breaks) and len(rows.rows) == len(np.unique(stamps)):
+        return odometry
+    return se2.interpolate(rows.rows[:, 0], rows.rows[:, 1:], stamps)

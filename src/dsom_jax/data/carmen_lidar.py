@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from dsom_jax.data.documents import read_yaml
+from dsom_jax.data.range_codes import detect_no_return
 from dsom_jax.errors import UserError
 from dsom_jax.lidar import LidarConfig
 
@@ -40,26 +41,6 @@ def guess_config(beams: int) -> LaserConfig:
     """CARMEN's own guess for FLASER and LASER: the first beam points to the right, -90 deg."""
     degrees = INCREMENT_DEG.get(beams) or 180.0 / max(beams - 1, 1)
     return LaserConfig(-math.pi / 2, math.radians(degrees), None)
-
-
-def detect_no_return(ranges: np.ndarray) -> float | None:
-    """Shortest reading (m) that stands for "no return" in this log, None if there is no such value.
-
-    Drivers write a constant beyond the sensor's reach (81.83 or 81.91 for a SICK in centimetre mode), some let it
-    flicker by centimetres. The readings within 0.1 m of the log's maximum are taken for it if one value (to the
-    centimetre) makes up half of them, occurs ten times and in a 2000th of all readings, and they outnumber all of the
-    metre below: walls scatter, a constant does not.
-    """
-    values = ranges[np.isfinite(ranges) & (ranges > 0)]
-    if not values.size:
-        return None
-    top = values.max()
-    code, below = values[values > top - 0.1], ((values > top - 1.1) & (values <= top - 0.1)).sum()
-    most = np.unique(np.rint(code * 100), return_counts=True)[1].max()
-    if most >= max(10, values.size / 2000, code.size / 2) and code.size > below:
-        # Readings are rounded to centimetres: half a centimetre below the shortest of them.
-        return float(code.min() - 0.005)
-    return None
 
 
 def lidar_of(

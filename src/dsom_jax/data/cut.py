@@ -13,15 +13,16 @@ from dsom_jax.errors import UserError
 
 def thin(log: RawLog, update_min_d: float = 0.25, update_min_a: float = 0.2) -> np.ndarray:
     """Indices (M,) of the scans that a filter uses, as in nav2_amcl: the first, and each one at which the odometry has
-    moved ``update_min_d`` metres or turned ``update_min_a`` radians since the last used scan."""
+    moved ``update_min_d`` metres or turned ``update_min_a`` radians since the last used scan, or jumped."""
     if update_min_d < 0 or update_min_a < 0:
         raise UserError(f"update_min_d = {update_min_d}, update_min_a = {update_min_a}: must not be negative")
     x, y, theta = log.odometry.T.tolist()
+    broken = np.zeros(len(log), bool) if log.broken is None else log.broken
     used = [0] if len(log) else []
     for n in range(1, len(log)):
         k = used[-1]
         turned = abs((theta[n] - theta[k] + np.pi) % (2 * np.pi) - np.pi)
-        if (x[n] - x[k]) ** 2 + (y[n] - y[k]) ** 2 >= update_min_d**2 or turned >= update_min_a:
+        if (x[n] - x[k]) ** 2 + (y[n] - y[k]) ** 2 >= update_min_d**2 or turned >= update_min_a or broken[n]:
             used.append(n)
     return np.array(used, int)
 

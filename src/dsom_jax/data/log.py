@@ -48,6 +48,8 @@ class RawLog:
         reference: (N, 3) float64 pose of the base in the map frame, NaN where unknown; None without a reference.
         report: what was skipped on reading.
         path: where the log was read from.
+        broken: (N,) bool, the odometry jumped or was reset since the scan before; its motion there is zero. None if
+            nobody looked.
     """
 
     ranges: np.ndarray
@@ -57,6 +59,7 @@ class RawLog:
     reference: np.ndarray | None = None
     report: Report = field(default_factory=Report)
     path: Path = Path("log")
+    broken: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.stamps)
@@ -124,9 +127,9 @@ def limited(log: RawLog, range_max: float) -> RawLog:
 def select(log: RawLog, keep: np.ndarray) -> RawLog:
     """The scans ``keep`` (mask or indices) of a log."""
     reference = None if log.reference is None else log.reference[keep]
-    return replace(
-        log, ranges=log.ranges[keep], odometry=log.odometry[keep], stamps=log.stamps[keep], reference=reference
-    )
+    broken = None if log.broken is None else log.broken[keep]
+    kept = {name: getattr(log, name)[keep] for name in ("ranges", "odometry", "stamps")}
+    return replace(log, **kept, reference=reference, broken=broken)
 
 
 def tidy(log: RawLog) -> RawLog:
@@ -138,6 +141,17 @@ def tidy(log: RawLog) -> RawLog:
     log = select(log, ~repeated(log.ranges, log.odometry, log.stamps, log.report))
     report_stamps(log.stamps, log.report)
     return log
+
+
+def report_still(log: RawLog) -> None:
+    """Note odometry that does not move: wheels that do not report look like this, and so does a robot at rest."""
+    if len(log) < 3 or not (np.ptp(log.odometry[:, :2], axis=0) < 0.01).all():
+        return
+    if np.abs(se2.wrap(log.odometry[:, 2] - log.odometry[0, 2])).max() < np.radians(0.5):
+        log.report.add(f"{STILL}; --odom-topic or --odom-frame chooses another")
+
+
+STILL = "odometry that never moves in the whole log"
 
 
 def rigid_mount(odometry: np.ndarray, sensor: np.ndarray) -> np.ndarray | None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from dsom_jax.data.bag import is_bag
+from dsom_jax.data.bag_map import load_bag_map
 from dsom_jax.data.documents import read_yaml
 from dsom_jax.data.dxf import Drawing, load_drawing
 from dsom_jax.data.log import Report
@@ -15,11 +17,13 @@ from dsom_jax.training.options import override
 
 
 def load_map(path: str | Path, report: Report | None = None) -> OccupancyGrid:
-    """A ROS map_server yaml, a DXF drawing, or a yaml with ``drawing: FILE.dxf`` and fields of :class:`Drawing`.
+    """A ROS map_server yaml, a bag with a map, a DXF drawing, or a yaml with ``drawing: FILE.dxf`` and how to read it.
 
     A drawing that is named without a yaml is read with the defaults. ``report`` takes what was left out or is odd.
     """
     path = Path(path)
+    if is_bag(path):
+        return load_bag_map(path, report)
     if path.suffix.lower() in (".dxf", ".dwg"):
         return load_drawing(path, report=report)
     fields = read_yaml(path, "map yaml")

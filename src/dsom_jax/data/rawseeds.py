@@ -28,6 +28,7 @@ from dsom_jax.data import se2
 from dsom_jax.data.carmen_lidar import LaserConfig, guess_config, lidar_of
 from dsom_jax.data.files import read_lines
 from dsom_jax.data.log import RawLog, Report, limit_ranges, majority_beams, tidy
+from dsom_jax.data.log_options import AS_TOLD, LogOptions
 from dsom_jax.data.odometry import odometry_at
 from dsom_jax.data.trajectory import Trajectory, associate
 from dsom_jax.errors import UserError
@@ -48,20 +49,18 @@ def is_rawseeds(path: str | Path) -> bool:
     return any(_scan_files(path)) if path.is_dir() else path.name.lower().endswith(SUFFIXES)
 
 
-def load_rawseeds(
-    path: str | Path, range_max: float | None = None, mount: tuple[float, float, float] | None = None
-) -> RawLog:
+def load_rawseeds(path: str | Path, options: LogOptions = AS_TOLD, range_max: float | None = None) -> RawLog:
     """Scans of one laser of a session, with the odometry and, where there is one, the ground truth beside it.
 
-    ``path`` is a SICK file, or the folder of the session, of which the front laser is read. ``mount`` is the pose of
-    the laser on the base (m, m, rad), by default that of the project's robot; ``meta.yaml`` beside the files overrides
-    it, and angles and limits as for CARMEN logs. Readings from ``range_max`` metres on are no returns.
+    ``path`` is a SICK file, or the folder of the session, of which the front laser is read. Without
+    ``options.mount`` the laser sits as on the project's robot; ``meta.yaml`` beside the files overrides that,
+    and angles and limits as for CARMEN logs. Readings from ``range_max`` metres on are no returns.
     """
     path, report = _scan_file(Path(path)), Report()
     stamps, ranges, config = _scans(path, report)
     session, laser = path.name.rsplit("-SICK_", 1)
-    pose = np.array(MOUNTS[laser.split(".")[0].upper()] if mount is None else mount, float)
-    lidar = lidar_of(path, ranges, config, {}, pose, range_max)
+    pose = np.array(MOUNTS[laser.split(".")[0].upper()], float)
+    lidar = options.mounted(lidar_of(path, ranges, config, {}, pose, range_max))
     odometry = _rows(_sibling(path, session, ODOMETRY), 7, (0, 4, 5, 6), report)
     poses = odometry_at(facing_forward(odometry, report), stamps, report)
     reference = _reference(path, session, stamps, report)

@@ -11,7 +11,8 @@ import numpy as np
 import yaml
 
 from dsom_jax.atomic import write_atomic
-from dsom_jax.data import RawLog, load_log
+from dsom_jax.data import LogOptions, RawLog, load_log
+from dsom_jax.data.bag import is_bag
 from dsom_jax.data.documents import read_yaml
 from dsom_jax.data.dxf import UNITS
 from dsom_jax.data.log import limited
@@ -195,12 +196,9 @@ def read_logs(plan: Plan, data: Path) -> Iterator[RawLog]:
         raise UserError(f"{data}: holds nothing like {', '.join(plan.logs)}; see README.md for the layout")
     for path in paths:
         beside = path.with_suffix(".tum")
-        log = load_log(
-            path,
-            reference=beside if beside.is_file() else None,
-            scan_topic=plan.scan_topic or None,
-            odom_topic=plan.odom_topic or None,
-        )
+        of_bags = LogOptions(scan_topic=plan.scan_topic or None, odom_topic=plan.odom_topic or None)
+        options = of_bags if is_bag(path) else LogOptions()
+        log = load_log(path, options, reference=beside if beside.is_file() else None)
         for line in log.report.lines():
             print(f"{path.name}: {line}")
         yield limited(log, plan.laser_max_range)
