@@ -74,9 +74,9 @@ def load_bag(path: str | Path, options: LogOptions = AS_TOLD, range_max: float |
     with open_bag(path) as reader:
         topics = {c.topic: c.msgtype for c in reader.connections}
         scan_topic = _scan_topic(path, topics, options)
-        odom_topic = _odometry_topic(path, topics, scan_topic, options, report)
         if options.reference_topic:
             choose(path, topics, REFERENCES, options.reference_topic, "reference_topic")
+        odom_topic = _odometry_topic(path, topics, scan_topic, options, report)
         messages = _read(reader, (scan_topic, odom_topic, options.reference_topic), report)
     if not messages.scans:
         raise UserError(f"{path}: topic {scan_topic} holds no scan; {listed(topics)}")

@@ -90,8 +90,9 @@ class LogOptions:
             except ValueError:
                 fix = "give FROM:TO, radians or degrees as in 80deg:100deg"
                 raise UserError(f"--laser-mask {mask}: {fix}") from None
-            # Counter-clockwise from the first to the second, also over pi.
-            inside |= (bearings - start) % (2 * np.pi) <= (end - start if end >= start else (end - start) % (2 * np.pi))
+            # Counter-clockwise from the first to the second, also over pi; bearings are told in single precision.
+            width = end - start if end >= start else (end - start) % (2 * np.pi)
+            inside |= (bearings - start + 1e-4) % (2 * np.pi) <= width + 2e-4
         return inside
 
     def seconds(self) -> float | None:

@@ -58,8 +58,9 @@ def _everywhere(ranges: np.ndarray, code: float) -> bool:
 def zero_is_no_return(ranges: np.ndarray, reach: float, report: Report) -> bool:
     """Whether zeros in ranges (N, B) stand for "nothing within reach" rather than for errors; says so if they do.
 
-    They do if nothing else stands for it and zeros lie beside long readings: of two neighbours of a run of zeros the
-    longer one outranks three quarters of all readings, on average. Beams that are zero nearly always see the robot.
+    They do if nothing else stands for it, and zeros come in runs of three beams and more beside long readings, which
+    outrank 65 % of all readings on average (made drives: 70 to 74 % beside what is out of reach, 50 % beside random
+    errors, 26 % beside what is too near). Beams that are zero nearly always see the robot itself.
     """
     zero = (ranges == 0) & ((ranges == 0).mean(axis=0) < 0.9)
     if zero.sum() < max(100, 1e-3 * ranges.size) or (ranges >= reach).any():
@@ -67,10 +68,10 @@ def zero_is_no_return(ranges: np.ndarray, reach: float, report: Report) -> bool:
     known = np.isfinite(ranges) & (ranges > 0)
     run_starts, run_ends = zero[:, 1:-1] & known[:, :-2], zero[:, 1:-1] & known[:, 2:]
     edges = np.concatenate([ranges[:, :-2][run_starts], ranges[:, 2:][run_ends]])
-    if len(edges) < 50:
+    if len(edges) < 50 or zero.sum() < 3 * len(edges) / 2:
         return False
     rank = np.searchsorted(np.sort(ranges[known]), edges).mean() / known.sum()
-    if rank < 0.75:
+    if rank < 0.65:
         return False
     report.add("readings of 0 m lie beside long ones and are taken for no returns", count=int(zero.sum()))
     return True

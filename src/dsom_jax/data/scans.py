@@ -256,7 +256,8 @@ def _by_walls(scans: Scans, said: float, implied: float) -> float | None:
         return None
     for step in (said, implied):
         angle = step * np.arange(scans.ranges.shape[1])
-        x, y = scans.ranges * np.cos(angle), scans.ranges * np.sin(angle)
+        ranges = np.where(np.isfinite(scans.ranges), scans.ranges, np.nan)
+        x, y = ranges * np.cos(angle), ranges * np.sin(angle)
         a, b, c = (np.stack([v[:, k : v.shape[1] - 2 * apart + k] for v in (x, y)]) for k in (0, apart, 2 * apart))
         chord = np.hypot(*(c - a))
         # In shares of the chord, positive towards the lidar.
