@@ -37,7 +37,13 @@ def planar(position: Any, orientation: Any) -> tuple[float, float, float]:
     return position.x, position.y, float(yaw_of(np.array([orientation.x, orientation.y, orientation.z, orientation.w])))
 
 
-def matrix(row: np.ndarray) -> np.ndarray:
+def matrix(translation: Any, rotation: Any) -> np.ndarray:
+    """Homogeneous (4, 4) of a ROS translation and quaternion."""
+    t, q = translation, rotation
+    return homogeneous(np.array([t.x, t.y, t.z, q.x, q.y, q.z, q.w], float))
+
+
+def homogeneous(row: np.ndarray) -> np.ndarray:
     """Homogeneous (4, 4) of a translation and a quaternion (7,) = (x, y, z, qx, qy, qz, qw)."""
     q = row[3:] / (np.linalg.norm(row[3:]) or 1.0)
     x, y, z, w = q
@@ -140,7 +146,7 @@ class TfTree:
         for edge in self.chain(frame):
             if edge[0] == top:
                 break
-            pose = matrix(self.table(edge)[0, 1:]) @ pose
+            pose = homogeneous(self.table(edge)[0, 1:]) @ pose
             chain[edge[0]] = pose
         return chain
 
