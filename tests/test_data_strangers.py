@@ -184,7 +184,7 @@ def test_a_jump_of_the_odometry_is_no_motion(tmp_path: Path, kind: str) -> None:
 
 
 def test_a_single_wild_odometry_message_is_dropped(tmp_path: Path) -> None:
-    wild = [(t, a, b, (1e4, *v[1:]) if n in (300, 500) else v) for n, (t, a, b, v) in enumerate(wheels(DRIVE))]
+    wild = [(t, a, b, (1e4, *v[1:]) if n in (100, 200) else v) for n, (t, a, b, v) in enumerate(wheels(DRIVE))]
     log = load(tmp_path, [*lasers(DRIVE, LIDAR), *wild, *MOUNT])
     assert said(log, "far from their neighbours") == 2 and not log.broken.any() and (drift(log) < DRIFT).all()
 
@@ -261,7 +261,8 @@ def test_the_odometry_of_another_base_frame(tmp_path: Path) -> None:
     log = load(tmp_path, [*lasers(DRIVE, LIDAR), *wheels(DRIVE, child="axle"), *tree], base_frame="centre")
     axle = load_log(tmp_path / "made")
     np.testing.assert_allclose(log.lidar.mount, (0.3, 0.0, 0.0), atol=1e-9)
-    np.testing.assert_allclose(log.odometry, se2.compose(axle.odometry, np.array([0.5, 0, 0])), atol=1e-6)
+    # Interpolated along chords: half a metre of lever times the square of half a step's turn, 0.02 rad.
+    np.testing.assert_allclose(log.odometry, se2.compose(axle.odometry, np.array([0.5, 0, 0])), atol=2e-4)
 
 
 def test_masks_and_least_ranges(tmp_path: Path) -> None:
@@ -382,7 +383,8 @@ def test_zeros_beside_long_readings_are_no_returns_and_others_errors(tmp_path: P
     gone = np.stack([v[0] >= 6 for _, _, _, v in scans])
     np.testing.assert_array_equal(np.isposinf(log.ranges), gone)
     assert said(log, "readings of 0 m") == gone.sum()
-    lost = [(t, a, b, (np.where(rng.random(180) < 0.1, 0.0, v[0].clip(0, 9)), *v[1:])) for t, a, b, v in scans]
+    known = [(t, a, b, (np.where(np.isfinite(v[0]), v[0], np.nan), *v[1:])) for t, a, b, v in scans]
+    lost = [(t, a, b, (np.where(rng.random(180) < 0.1, 0.0, v[0]), *v[1:])) for t, a, b, v in known]
     errors = load(tmp_path / "lost", [*lost, *wheels(DRIVE), *MOUNT])
     assert not np.isposinf(errors.ranges).any() and 0.05 < np.isnan(errors.ranges).mean() < 0.15
 

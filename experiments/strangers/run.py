@@ -1,6 +1,7 @@
-"""Bags as strangers bring them, each beside its clean twin, in a made building: python experiments/strangers/run.py --out DIR
+"""Bags as strangers bring them, each beside its clean twin, in a made building.
 
-Writes REPORT.md and results.json. A rate is to be within 2 points of the twin's.
+python experiments/strangers/run.py --out DIR writes REPORT.md and results.json.
+Rates are to be within 2 points of the twins'.
 """
 
 from __future__ import annotations

@@ -48,7 +48,7 @@ def assemble(scans: Scans, rows: np.ndarray, sensor: Sensor, options: LogOptions
     nothing = zero_is_no_return(scans.ranges, lidar.range_max, report)
     ranges = np.where(scans.ranges == 0, np.float32(np.inf), scans.ranges) if nothing else scans.ranges
     scans = replace(scans, ranges=limit_ranges(ranges, lidar.range_min, lidar.range_max))
-    scans = _timed(scans, sensor, options, report)
+    scans = _timed(scans, sensor, odometry, options, report)
     scans = _in_time(scans, beams, odometry, lidar, options, report)
     poses = odometry.at(scans.stamps)
     report_uncovered(odometry, scans.stamps, poses, report)
@@ -77,7 +77,7 @@ def _lidar(beams: Beams, sensor: Sensor, reach: float, options: LogOptions, path
         raise UserError(f"{path}: LaserScan: {error}; repair the driver's message") from None
 
 
-def _timed(scans: Scans, sensor: Sensor, options: LogOptions, report: Report) -> Scans:
+def _timed(scans: Scans, sensor: Sensor, odometry: Odometry, options: LogOptions, report: Report) -> Scans:
     """The scans with a time from beam to beam that can be: ``--scan-time``, else as told if scans do not overlap."""
     gaps = np.maximum(scans.counts - 1, 1)
     if options.scan_time is not None:
@@ -90,10 +90,16 @@ def _timed(scans: Scans, sensor: Sensor, options: LogOptions, report: Report) ->
         told = f"{float(beam_time[wrong][0]):.3g} s from beam to beam, a scan each {period:.3g} s"
         kind = "scans whose time_increment is too long, not used; --scan-time says how long a scan takes"
         report.add(kind, told, int(wrong.sum()))
-    elif not beam_time.any() and 0 < sensor.scan_time <= 1.2 * period:
+    elif not beam_time.any() and 0 < sensor.scan_time <= 1.2 * period and _turns_much(scans, odometry, sensor):
         kind = f"scans with a scan_time of {sensor.scan_time:.3g} s and no time_increment: taken at once"
         report.add(f"{kind}; if they are not, give --scan-time {sensor.scan_time:.3g}", count=len(scans))
     return replace(scans, beam_time=np.where(wrong, 0.0, beam_time))
+
+
+def _turns_much(scans: Scans, odometry: Odometry, sensor: Sensor) -> bool:
+    """Whether in a tenth of the scans the robot turns by two beams and more while one is taken."""
+    rates = np.abs(se2.wrap(np.diff(odometry.rows[:, 3]))) / np.diff(odometry.rows[:, 0])
+    return len(rates) > 0 and np.quantile(rates, 0.9) * sensor.scan_time > 2 * np.median(np.abs(scans.step))
 
 
 def _in_time(
