@@ -171,6 +171,12 @@ def chosen_methods(names: str, checkpoint: Any) -> tuple[str, ...]:
     return methods
 
 
+def left_out(methods: Sequence[str]) -> str:
+    """One line about methods of the standard comparison that are not among ``methods``, and why; empty if all are."""
+    missing = [name for name in STANDARD if name not in methods]
+    return f"left out: {', '.join(missing)}: no trained network here; name its folder with --checkpoint" * bool(missing)
+
+
 def run_method(name: str, suite: Suite, keys: Sequence[Key], build: Build, progress: Advance | None = None) -> Record:
     """One method on all sequences."""
     parts: dict[str, dict[str, list[metrics.Runs]]] = {e: {"global": [], "kidnap": []} for e in ESTIMATES}
@@ -283,6 +289,7 @@ def main() -> None:
     asked = {"dsom": args.checkpoint, "pf_net": args.pf_net, "pfrnn": args.pfrnn}
     folders = find_networks(asked)
     methods = chosen_methods(args.methods, folders)
+    missing = "" if args.methods else left_out(methods)
     check_used(asked, methods)
     suite = load_suite(args.suite)
     trained = load_networks(folders, methods, suite.lidar)
@@ -295,6 +302,8 @@ def main() -> None:
     data = summary(suite, records, settings)
     data["methods"] |= {name: foreign(suite, given, args.seed) for name, given in others.items()}
     report.print_tables(data)
+    if missing:
+        print(missing)
     if folder:
         write_results(folder, suite, records, data)
     if folder and args.per_run:

@@ -36,12 +36,15 @@ DRAFT = ".orbax-checkpoint-tmp"
 FORMAT = 1
 JSON_BYTES = 2**24
 """No record of ours comes near; a larger file is something else."""
-SHIPPED = Path(__file__).parents[2] / "checkpoints" / "dsom"
-"""The network in the repository that this package runs from; not there once it is installed elsewhere."""
+SHIPPED = next(
+    (folder for up in (2, 0) if (folder := Path(__file__).parents[up] / "checkpoints" / "dsom").is_dir()),
+    Path(__file__).parents[2] / "checkpoints" / "dsom",
+)
+"""The network that comes with the package: in the repository beside ``src``, once installed in the package itself."""
 
 
 def shipped(kind: str = "dsom") -> Path | None:
-    """The folder of the network of that kind that comes with the repository, if there is one."""
+    """The folder of the network of that kind that comes with the package, if there is one."""
     folder = SHIPPED.with_name(kind.replace("_", "-"))
     return folder if (folder / PROVENANCE).is_file() else None
 

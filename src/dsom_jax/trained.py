@@ -42,7 +42,7 @@ def check_used(asked: Mapping[str, Path | None], methods: Sequence[str]) -> None
 
 
 def find_networks(asked: Mapping[str, Path | None]) -> dict[str, Path | None]:
-    """Folder of each kind of network: the one asked for, or the one in the repository, if there is any."""
+    """Folder of each kind of network: the one asked for, or the one that comes with the package, if there is any."""
     return {kind: folder or checkpoint.shipped(kind) for kind, folder in asked.items()}
 
 

@@ -1,0 +1,36 @@
+"""The command lines by name: ``python -m dsom_jax bench ...``; of an installed package also ``dsom-bench ...``."""
+
+from __future__ import annotations
+
+import sys
+from functools import partial
+from importlib import import_module
+from importlib.util import find_spec
+
+from dsom_jax.errors import UserError, run_cli
+
+COMMANDS = ("bench", "localize", "evaluate", "train", "train_filter")
+
+
+def start(name: str) -> None:
+    """Run the command ``name`` with the words of the command line; what it needs is imported here."""
+    run_cli(lambda: import_module(f"dsom_jax.{name}").main())
+
+
+bench, localize, evaluate, train, train_filter = (partial(start, name) for name in COMMANDS)
+
+
+def main() -> None:
+    """The first word of the command line is a command."""
+    names = ", ".join(name for name in COMMANDS if find_spec(f"dsom_jax.{name}"))
+    if len(sys.argv) < 2 or sys.argv[1] in ("-h", "--help"):
+        print(f"usage: python -m dsom_jax COMMAND ...; commands: {names}")
+        return
+    name = sys.argv.pop(1)
+    if name.replace("-", "_") not in COMMANDS:
+        raise UserError(f"{name}: no such command; there are {names}")
+    start(name.replace("-", "_"))
+
+
+if __name__ == "__main__":
+    run_cli(main)
