@@ -216,6 +216,7 @@ np.savez(sys.argv[1], *jax.tree.leaves(result))
 """
 
 
+@pytest.mark.slow
 def test_two_devices_give_the_same_numbers(tmp_path):
     flags = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=2"
     path = os.pathsep.join([os.path.dirname(__file__), *filter(None, [os.environ.get("PYTHONPATH")])])

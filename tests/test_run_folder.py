@@ -310,3 +310,12 @@ def test_arrays_of_a_state_are_damaged_or_whole(tmp_path, monkeypatch):
     largest.write_bytes(largest.read_bytes()[:100])
     with pytest.raises(UserError, match="damaged"):
         checkpoint.load_state(tmp_path / "state-00000001", tree)
+
+
+@pytest.mark.slow
+def test_kills_full_disks_and_races_lose_nothing(tmp_path):
+    """A few of each; ``experiments/stress/run_folder.py`` alone does a hundred."""
+    script = Path(__file__).resolve().parents[1] / "experiments" / "stress" / "run_folder.py"
+    command = [sys.executable, str(script), "--kill", "4", "--fill", "2", "--race", "2", "--no-save"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0 and done.stdout.endswith("0 faults\n"), done.stdout + done.stderr

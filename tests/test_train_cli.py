@@ -73,6 +73,7 @@ def kill_after_lines(process: subprocess.Popen, log: Path, lines: int) -> None:
     process.communicate()
 
 
+@pytest.mark.slow
 def test_killed_run_ends_like_an_uninterrupted_one(files):
     whole = start(files, "whole")
     assert whole.wait() == 0, whole.communicate()[1]

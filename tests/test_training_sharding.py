@@ -10,6 +10,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
+import pytest
 
 from two_device_training import losses
 
@@ -25,6 +26,7 @@ def on_two_devices() -> np.ndarray:
     return np.asarray(json.loads(done.stdout.splitlines()[-1]))
 
 
+@pytest.mark.slow
 def test_two_devices_follow_the_loss_curve_of_one():
     assert jax.device_count() == 1
     one, two = np.array([losses(*case) for case in CASES]), on_two_devices()
