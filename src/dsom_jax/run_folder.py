@@ -28,6 +28,8 @@ from dsom_jax.training.loop import averaged_model, late_start
 R = TypeVar("R", bound="Run")
 S = TypeVar("S")
 LOCK, OWNER, RUN = ".lock", "owner.json", "run.json"
+THIS_PROCESS = uuid.uuid4().hex
+"""What ``owner.json`` calls this process; its number alone is given to others, too."""
 
 
 class Claim:
@@ -37,7 +39,7 @@ class Claim:
     """
 
     def __init__(self, folder: Path) -> None:
-        self.folder, self.name = folder, uuid.uuid4().hex
+        self.folder = folder
         self.lock = FileLock(folder / LOCK, is_singleton=True)
         try:
             self.lock.acquire(timeout=0)
@@ -62,12 +64,12 @@ class Claim:
 
     def write(self) -> None:
         """Write ``owner.json``."""
-        who = {"process": os.getpid(), "host": platform.node(), "claim": self.name}
+        who = {"process": os.getpid(), "host": platform.node(), "claim": THIS_PROCESS}
         checkpoint.write_json(self.folder / OWNER, {**who, "wrote": sorted(self.wrote)})
 
     def check(self) -> None:
         """UserError if the folder is no longer that of this process: nothing may be written or removed there."""
-        if self.read().get("claim") != self.name:
+        if self.read().get("claim") != THIS_PROCESS:
             raise UserError(f"{self.folder}: was taken by another training (see {OWNER}); nothing was written there")
 
     def announce(self, *names: str) -> None:
