@@ -33,7 +33,7 @@ def test_a_command_is_the_first_word(monkeypatch, capsys):
         commands.main()
     assert not stop.value.code and "Train PF-Net or PFRNN" in capsys.readouterr().out
     monkeypatch.setattr(sys, "argv", ["dsom_jax", "fly"])
-    with pytest.raises(UserError, match="fly: no such command; there are bench"):
+    with pytest.raises(UserError, match="fly: no such command; there are demo"):
         commands.main()
     monkeypatch.setattr(sys, "argv", ["dsom_jax"])
     commands.main()

@@ -20,6 +20,7 @@ LAYERS = (
     ("atomic", "data", "checkpoint", "run_folder", "trained", "plotting", "report", "judging", "view"),
     ("live",),
     (
+        "__main__",
         "cli",
         "trainer",
         "train",

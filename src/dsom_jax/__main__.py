@@ -9,7 +9,7 @@ from importlib.util import find_spec
 
 from dsom_jax.errors import UserError, run_cli
 
-COMMANDS = ("bench", "localize", "evaluate", "train", "train_filter")
+COMMANDS = ("demo", "bench", "localize", "certify", "export", "evaluate", "train", "train_filter")
 
 
 def start(name: str) -> None:
@@ -17,7 +17,7 @@ def start(name: str) -> None:
     run_cli(lambda: import_module(f"dsom_jax.{name}").main())
 
 
-bench, localize, evaluate, train, train_filter = (partial(start, name) for name in COMMANDS)
+demo, bench, localize, certify, export, evaluate, train, train_filter = (partial(start, name) for name in COMMANDS)
 
 
 def main() -> None:
