@@ -25,7 +25,8 @@ from dsom_jax.episode import Episode
 from dsom_jax.filters.learned import Prior, scatter
 from dsom_jax.filters.methods import LEARNED
 from dsom_jax.geometry import compose
-from dsom_jax.judging.metrics import pose_error, wilson
+from dsom_jax.judging.metrics import pose_error
+from dsom_jax.judging.statistics import rate_interval
 from dsom_jax.montecarlo import run, run_keys
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.run_folder import commit
@@ -71,7 +72,7 @@ def summary(position: np.ndarray, heading: np.ndarray) -> dict[str, Any]:
         "drives": len(position),
         "runs": position.shape[1],
         "tracked": float(close.mean()),
-        "tracked_ci95": list(wilson(float(close.mean()), len(close))),
+        "tracked_ci95": rate_interval(close, np.arange(len(close))),
         "inside": float(((position < CLOSE[0]) & (heading < CLOSE[1])).mean()),
         "final_e_pos_m_median": float(np.median(last)),
         "final_e_pos_m_p90": float(np.quantile(last, 0.9)),

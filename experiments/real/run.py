@@ -127,7 +127,8 @@ HEAD = f"""\
 
 Written by `python experiments/real/run.py`; do not edit. Every segment starts without any prior on the pose.
 
-- converged: 5 updates in a row within 2 m and 10 deg [95 % interval]; steps: updates before, median
+- converged: 5 updates in a row within 2 m and 10 deg [95 % interval by segment; where all runs of each agree, Wilson's
+  with segments as trials]; steps: updates before, median
 - retention: share of the later updates that stay within; strict: last estimate within 0.5 m and 5 deg
 - median error: of the last estimate, over converged runs
 - false confident: updates at which the filter claims to know (lost < 5 %) and is not within 2 m and 10 deg
@@ -154,8 +155,9 @@ def result_rows(result: dict[str, Any]) -> list[tuple[str, ...]]:
 def numbers(part: dict[str, Any]) -> tuple[str, ...]:
     """Cells of one phase."""
     low, high = part["converged_ci95"]
+    bounds = "" if low is None else f" [{percent(low)}-{percent(high)}]"
     return (
-        str(part["experiments"]), f"{percent(part['converged'])} [{100 * low:.1f}-{100 * high:.1f}]",
+        str(part["experiments"]), percent(part["converged"]) + bounds,
         "-" if part["steps_median"] is None else f"{part['steps_median']:g}", percent(part["retention"], 2),
         percent(part["strict_success"]), "-" if part["e_pos_m_median"] is None else f"{part['e_pos_m_median']:.3f}",
         percent(part["false_confident"], 2),

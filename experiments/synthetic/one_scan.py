@@ -16,7 +16,7 @@ from scenes import Change, Condition, Scans, beams_of, map_and_building, take
 from tables import markdown, percent
 
 from dsom_jax.filters.methods import DRAWN, Settings, make_proposal
-from dsom_jax.judging import metrics, quality
+from dsom_jax.judging import quality
 from dsom_jax.judging.statistics import interval, rate_interval
 from dsom_jax.nn import DSOM
 from dsom_jax.plotting.common import legend
@@ -152,7 +152,6 @@ def told(parts: list[quality.Quality]) -> dict[str, Any]:
         "mass_mean_ci95": interval(mass, world),
         "mass_gt_1pct_ci95": rate_interval(above, world),
         "top1_ci95": rate_interval(top, world),
-        "top1_wilson95": metrics.wilson(float(top.mean()), len(top)),
     }
 
 

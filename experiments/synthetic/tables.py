@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 
+from dsom_jax.report import outward
+
 
 def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """A markdown table; the first column to the left, numbers to the right."""
@@ -26,8 +28,11 @@ def bounds(interval: Sequence[float | None], scale: float, digits: int) -> str:
     """`` [low-high]``, nothing where there is no interval."""
     if any(missing(bound) for bound in interval):
         return ""
-    low, high = (scale * bound for bound in interval)  # type: ignore[operator]
-    return f" [{low:.{digits}f}-{high:.{digits}f}]"
+    low, high = (
+        outward(scale * bound, digits, towards)  # type: ignore[operator]
+        for bound, towards in zip(interval, (math.floor, math.ceil), strict=True)
+    )
+    return f" [{low}-{high}]"
 
 
 def missing(value: float | None) -> bool:

@@ -170,5 +170,10 @@ def _percent(rate: float | None) -> str:
 def _interval(bounds: list[float], scale: float, digits: int = 0) -> str:
     if any(_missing(bound) for bound in bounds):
         return ""
-    low, high = (scale * bound for bound in bounds)
-    return f" [{low:.{digits}f}-{high:.{digits}f}]"
+    return f" [{outward(scale * bounds[0], digits, math.floor)}-{outward(scale * bounds[1], digits, math.ceil)}]"
+
+
+def outward(value: float, digits: int, towards: Callable[[float], int]) -> str:
+    """A bound of an interval so that rounding does not narrow it; ``towards`` is floor or ceil."""
+    # Numbers that are decimals but for their last bit stay what they are.
+    return f"{towards(round(value * 10**digits, 6)) / 10**digits:.{digits}f}"
