@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from dsom_jax.belief.verdict import Verdict
 from dsom_jax.data import load_tum
 from dsom_jax.episode import Episode
 from dsom_jax.judging import scores as judging
@@ -32,7 +33,8 @@ def outcome(late: tuple[int, int], start: float = 100.0, mean_off: float = 1.0, 
     off = np.array([np.where((since < first) | (np.arange(UPDATES) >= AGAIN), 3.0, 0.1) for first in late])
     cluster = truth + off[..., None] * [0.0, 1.0, 0.0]
     info = SimpleNamespace(
-        mean=cluster + np.array([0.0, mean_off, 0.0]), cluster=cluster, lost=np.where(off > 2, 0.01, 0.9)
+        mean=cluster + np.array([0.0, mean_off, 0.0]), cluster=cluster, lost=np.where(off > 2, 0.01, 0.9),
+        verdict=np.where(off > 2, Verdict.LOCALIZED, Verdict.LOST),
     )
     odometry = np.stack([STEP, np.zeros(UPDATES), np.zeros(UPDATES)], -1)
     odometry[[0, MOVED, AGAIN]] = 0.0

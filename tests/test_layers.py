@@ -16,6 +16,7 @@ LAYERS = (
     ("occupancy", "lidar", "marching", "raycast", "resampling", "pose_grid", "episode"),
     ("motion", "sensor", "nn", "simulate"),
     ("proposals",),
+    ("belief",),
     ("filters", "training", "montecarlo", "ambiguity"),
     ("atomic", "data", "checkpoint", "run_folder", "trained", "plotting", "report", "judging", "view"),
     ("live",),
@@ -35,7 +36,7 @@ LAYERS = (
         "ros2",
     ),
 )
-DEVICE = 5
+DEVICE = 6
 """Layers below this are device code."""
 LAYER = {name: level for level, names in enumerate(LAYERS) for name in names}
 BANNED_IMPORTS = {

@@ -170,5 +170,5 @@ def test_floor_plans_get_models_of_their_own(call):
 def test_what_the_summary_says_of_the_filter_is_so(fields, proposal):
     args = localize.Args(Path("m.yaml"), Path("l.log"), Path("out"), particles=8, **fields)
     filter = localize.build(args, tiny_world.grid(), tiny_world.LIDAR)
-    assert localize.remembers(args) == (filter.begin() != ()) == (fields == {})
+    assert localize.remembers(args) == filter.drawn == (fields == {})
     assert localize.drawn_from(args) == proposal and not localize.needs_network(args)

@@ -50,3 +50,11 @@ def mean_pose(poses: Array, weights: Array) -> Array:
     """Weighted mean of poses (..., n, 3) with weights (..., n) that sum to one: (..., 3)."""
     xy = (weights[..., None] * poses[..., :2]).sum(-2)
     return jnp.concatenate([xy, circular_mean(poses[..., 2], weights)[..., None]], axis=-1)
+
+
+def pose_covariance(poses: Array, weights: Array, mean: Array) -> Array:
+    """Covariance (..., 3, 3) about ``mean`` (..., 3) of poses (..., n, 3) whose weights (..., n) sum to one."""
+    gap = poses - mean[..., None, :]
+    gap = gap.at[..., 2].set(wrap_angle(gap[..., 2]))
+    # A sum, not a product of matrices: that would add up in an order which depends on how many there are.
+    return (weights[..., None, None] * gap[..., :, None] * gap[..., None, :]).sum(-3)

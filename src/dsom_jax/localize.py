@@ -18,16 +18,17 @@ from rich import box
 from rich.table import Table
 
 from dsom_jax import checkpoint, report
+from dsom_jax.belief.watched import Watched
 from dsom_jax.cli import each, parse, stage
 from dsom_jax.data import LogOptions, RawLog, Report, load_log, load_map
 from dsom_jax.data.cut import segment_indices, splice, to_episode, without_repeats
 from dsom_jax.data.log import STILL, limited
 from dsom_jax.errors import UserError, run_cli
-from dsom_jax.filters.methods import DRAWN, REAL, make_filter, make_proposal
+from dsom_jax.filters.methods import DRAWN, REAL, make_filter, make_proposal, watch
 from dsom_jax.judging import metrics
 from dsom_jax.judging.foreign import named, replies_of
 from dsom_jax.judging.rooms import rooms_of
-from dsom_jax.judging.scores import Drive, Outcome, Replies, judged_by, replies, save_estimate, scores
+from dsom_jax.judging.scores import Drive, Outcome, Replies, judged_by, replies, save_estimate, scores, verdicts
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.montecarlo import run, run_keys
 from dsom_jax.occupancy import OccupancyGrid
@@ -227,16 +228,17 @@ def load_network(args: Args, lidar: LidarConfig) -> Any:
     return None if folder is None else checkpoint.load(folder, lidar=lidar)
 
 
-def build(args: Args, grid: OccupancyGrid, lidar: LidarConfig, network: Any = None) -> Filter:
-    """The filter that the arguments ask for."""
+def build(args: Args, grid: OccupancyGrid, lidar: LidarConfig, network: Any = None) -> Watched:
+    """The filter that the arguments ask for, with a verdict on its answers."""
     kind = DRAWN if args.map_kind == "drawn" else REAL
     own = ("particles", "t_cut", "max_beams", "seed", "memory")
     settings = replace(kind, **{name: getattr(args, name) for name in own})
     proposal = make_proposal(drawn_from(args), grid, lidar, settings, network)
-    return make_filter(args.method, proposal, grid, lidar, settings)
+    filter = make_filter(args.method, proposal, grid, lidar, settings)
+    return watch(filter, grid, lidar, settings, judged_by(args.method))
 
 
-def localize(filter: Filter, drives: Any, runs: int, seed: int) -> list[Outcome]:
+def localize(filter: Watched, drives: Any, runs: int, seed: int) -> list[Outcome]:
     """``runs`` Monte-Carlo repetitions of every drive, each drive in one call."""
     outcomes: list[Outcome] = []
     for number, drive in enumerate(drives):
@@ -244,6 +246,7 @@ def localize(filter: Filter, drives: Any, runs: int, seed: int) -> list[Outcome]
         start = time.perf_counter()
         keep = range(len(drive.stamps))
         result = jax.block_until_ready(run(filter, drive.episode, keys, keep))
+        result = result._replace(state=result.state.state, kept=result.kept.state)
         outcomes.append(Outcome(drive, result, time.perf_counter() - start))
     if len(outcomes) == 1:
         start = time.perf_counter()
@@ -277,8 +280,8 @@ def summary_of(
         "particles": args.particles, "segments": len(outcomes), "runs": args.runs, "updates": updates,
         "steps_per_segment": len(outcomes[0].drive.stamps), "seed": args.seed,
         "ms_per_update": 1e3 * float(np.median([o.seconds / len(o.drive.stamps) for o in timed])),
-        "confident": float(np.mean([np.asarray(o.result.info.lost) < metrics.CONFIDENT for o in outcomes])),
     }  # fmt: skip
+    head |= verdicts([o.result.info for o in outcomes])
     given = [replies(o.result.info, judged_by(args.method)) for o in outcomes]
     drives, rooms = [o.drive for o in outcomes], rooms_of(grid)
 
@@ -315,7 +318,7 @@ def print_summary(summary: dict[str, Any], folder: Path) -> None:
                 table.add_row(name, *(_cell(part[key], text) for _, key, text in COLUMNS))
         console.print(table)
     else:
-        sure = f"{summary['updates']} updates, sure of the answer in {summary['confident']:.1%} of them"
+        sure = f"{summary['updates']} updates, sure of the answer in {summary['certain']:.1%} of them"
         console.print(f"{sure}; no reference to judge by")
     console.print(f"{summary['ms_per_update']:.1f} ms per update of all {summary['runs']} runs", style="dim")
     console.print(f"look at {folder / 'report.html'}{worst(summary)}", soft_wrap=True, highlight=False)

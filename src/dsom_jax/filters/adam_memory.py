@@ -17,10 +17,16 @@ import jax
 import jax.numpy as jnp
 
 from dsom_jax import checks
-from dsom_jax.filters.adam_robust import AdamRobust, RobustState
+from dsom_jax.belief.grid_belief import GridBelief, Places
+from dsom_jax.belief.hypotheses import share_at
+from dsom_jax.filters.adam_robust import AdamRobust, Draw, RobustState
+from dsom_jax.filters.common import Info
 from dsom_jax.occupancy import is_free
 from dsom_jax.proposals.markov_grid import MarkovGrid, Recollection
-from dsom_jax.types import Array
+from dsom_jax.types import Array, Key
+
+_LEAST = 0.2
+"""Share of the evidence of a scan that brings nothing new."""
 
 
 @jax.tree_util.register_dataclass
@@ -53,3 +59,30 @@ class AdamMemory(AdamRobust):
         # The grid knows where the sensor may be; beside it the base may stand in a wall.
         stands = is_free(self.tables.grid, poses)
         return share + jnp.where(stands, self.proposal.log_prior(prepared, poses), -jnp.inf)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class AdamPlaces(AdamMemory):
+    """AdaM robust on the belief that knows which place: particles say where exactly within it.
+
+    Attributes:
+        proposal: the belief over the grid.
+    """
+
+    proposal: GridBelief  # type: ignore[assignment]  # in place of the memory that judges the whole grid every time
+
+    def _redraw(self, key: Key, state: RobustState, low: Array, prepared: Places) -> Draw:
+        """L: from the pool of the belief, which knows what it believed of each before the scan."""
+        poses, log_prior, log_q = self.proposal.draw(key, prepared, self.config.particles)
+        share = jnp.where(state.updates == 0, 0.0, jnp.log(self._share(state)))
+        stands = is_free(self.tables.grid, poses)
+        return Draw(poses, share + jnp.where(stands, log_prior - log_q, -jnp.inf) - jnp.log(low.sum()))
+
+    def _worth(self, state: RobustState, prepared: Places) -> Array:  # type: ignore[override]
+        """Less while lost, and less of a scan that is not new; a little, so that particles stay where it holds them."""
+        return super()._worth(state, prepared) * jnp.maximum(prepared.novelty, _LEAST)
+
+    def _doubted(self, info: Info, prepared: Places) -> Info:  # type: ignore[override]
+        """The place is lost if the belief is elsewhere, whichever of two equal clusters has survived."""
+        return info._replace(lost=jnp.maximum(info.lost, 1.0 - share_at(prepared.poses, info.cluster)))

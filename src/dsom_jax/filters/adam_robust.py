@@ -129,12 +129,13 @@ class AdamRobust:
         redrawn = self._redraw(k_low, state, low, prepared)
         # Weigh
         poses = jnp.where(low[:, None], redrawn.poses, kept.poses)
-        log_weights = jnp.where(low, redrawn.log_ratio, kept.log_ratio) + self._evidence(state, poses, inputs)
+        evidence = self._worth(state, prepared) * self._evidence(poses, inputs)
+        log_weights = jnp.where(low, redrawn.log_ratio, kept.log_ratio) + evidence
         total = logsumexp(log_weights)
         dead = ~jnp.isfinite(total)
         log_weights = jnp.where(dead, -jnp.log(self.config.particles), log_weights - total)
         # Estimate
-        info = describe(poses, jnp.exp(log_weights), low.mean(), dead)
+        info = self._doubted(describe(poses, jnp.exp(log_weights), low.mean(), dead), prepared)
         return RobustState(poses, log_weights, info.lost, state.updates + 1), info
 
     def _redraws(self, state: RobustState) -> Array:
@@ -168,11 +169,18 @@ class AdamRobust:
         # u is zero where no robot can stand, whatever q thinks: cells of PM may be larger than those of the map.
         return prior + jnp.where(is_free(self.tables.grid, poses), self.space.log_density_value, -jnp.inf)
 
-    def _evidence(self, state: RobustState, poses: Array, inputs: Inputs) -> Array:
-        """log p(z | x) (N,), tempered further while the filter is lost."""
+    def _worth(self, state: RobustState, prepared: Any) -> Array:
+        """Share of the evidence that counts (): less while the filter is lost."""
+        return 1.0 - self.config.caution * state.lost
+
+    def _evidence(self, poses: Array, inputs: Inputs) -> Array:
+        """log p(z | x) (N,)."""
         seen = inputs.ranges[:: self.beam_step]
-        evidence = beam_log_likelihood(seen, cast_rays(self.tables, poses, self.lidar), self.config.model)
-        return (1.0 - self.config.caution * state.lost) * evidence
+        return beam_log_likelihood(seen, cast_rays(self.tables, poses, self.lidar), self.config.model)
+
+    def _doubted(self, info: Info, prepared: Any) -> Info:
+        """What else is known of the answer."""
+        return info
 
 
 def resampling_log_weights(log_weights: Array, flatten: float) -> Array:

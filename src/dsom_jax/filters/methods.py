@@ -9,9 +9,13 @@ from typing import Any, Literal
 import jax
 
 from dsom_jax import checks
+from dsom_jax.belief.grid_belief import GridBeliefConfig, grid_belief
+from dsom_jax.belief.monitor import monitor
+from dsom_jax.belief.verdict import SHIPPED_HEAD, Head
+from dsom_jax.belief.watched import Watched
 from dsom_jax.episode import Episode
 from dsom_jax.filters.adam import AdamMCL
-from dsom_jax.filters.adam_memory import AdamMemory
+from dsom_jax.filters.adam_memory import AdamMemory, AdamPlaces
 from dsom_jax.filters.adam_robust import AdamRobust, RobustConfig
 from dsom_jax.filters.mcl import MCL
 from dsom_jax.filters.mixture import MixtureMCL
@@ -123,7 +127,8 @@ class Settings:
         memory_share: least and greatest weight of what that memory says, beside the particles' own past.
         memory_temper: factor on a scan's log-likelihood in that memory, in place of the grid's own: where the map is
             wrong, scans taken one after another err alike.
-        markov: how that memory moves, and those of the network.
+        belief: the belief over the grid of AdaM robust with a memory, and of every verdict.
+        markov: how the memories of Alg 1 and of the network move.
         markov_dsom, markov_hybrid: what a scan is worth in a memory of the network alone, and of it and the likelihood.
         network_share: as ``memory_share``, of a memory of the network.
     """
@@ -146,6 +151,7 @@ class Settings:
     memory: bool = False
     memory_share: tuple[float, float] = (0.01, 0.5)
     memory_temper: float = 0.05
+    belief: GridBeliefConfig = GridBeliefConfig()
     markov: MarkovGridConfig = MarkovGridConfig()
     markov_dsom: MarkovNetworkConfig = MarkovNetworkConfig()
     markov_hybrid: MarkovNetworkConfig = MarkovNetworkConfig(power=0.15, temper=0.01)
@@ -276,7 +282,8 @@ def make_filter(
         if isinstance(proposal, DSOMProposal):
             proposal = replace(proposal, sharpness=settings.robust_sharpness)
         if settings.memory and isinstance(proposal, LikelihoodGrid):
-            proposal = remembering(proposal, settings)
+            belief = grid_belief(proposal, grid, settings.belief)
+            return AdamPlaces(tables, space, belief, *parts, settings.memory_share)
         if isinstance(proposal, MarkovGrid):
             share = settings.network_share if isinstance(proposal, MarkovNetwork) else settings.memory_share
             return AdamMemory(tables, space, proposal, *parts, share)
@@ -292,3 +299,23 @@ def make_filter(
     if algorithm == "mixture_mcl":
         return MixtureMCL(world, proposal, config)
     return AdamMCL(world, proposal, config, settings.t_cut)
+
+
+def watch(
+    filter: Filter,
+    grid: OccupancyGrid,
+    lidar: LidarConfig,
+    settings: Settings,
+    estimate: str = "cluster",
+    head: Head = SHIPPED_HEAD,
+) -> Watched:
+    """The filter with a verdict on its answers; one that draws from the belief over the grid shares it.
+
+    ``estimate`` is the answer that is watched: the heaviest ``cluster``, or the ``mean`` as in the paper.
+    """
+    drawn = isinstance(filter, AdamPlaces)
+    belief = filter.proposal if isinstance(filter, AdamPlaces) else None
+    if belief is None:
+        belief = grid_belief(make_proposal("likelihood_grid", grid, lidar, settings), grid, settings.belief)  # type: ignore[arg-type]
+    tables = make_tables(grid, settings.robust_raycast, lidar.range_max)
+    return Watched(filter, belief, monitor(tables, lidar), drawn, head, estimate)

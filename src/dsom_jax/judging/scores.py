@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from dsom_jax.belief.verdict import Verdict
 from dsom_jax.data import save_tum
 from dsom_jax.episode import Episode
 from dsom_jax.judging import metrics
@@ -51,9 +52,18 @@ class Replies(NamedTuple):
 
 def replies(info: Any, estimate: str) -> Replies:
     """Those of a filter by its diagnostics (leaves (R, T, ...)); ``estimate`` is ``mean`` or ``cluster``."""
-    p_lost = np.asarray(info.lost, np.float64)
+    p_lost = np.asarray(getattr(info, "p_lost", info.lost), np.float64)
     poses = np.asarray(getattr(info, estimate))
+    if hasattr(info, "verdict"):
+        return Replies(poses, p_lost, np.asarray(info.verdict) == Verdict.LOCALIZED)
     return Replies(poses) if np.isnan(p_lost).all() else Replies(poses, p_lost, p_lost < metrics.CONFIDENT)
+
+
+def verdicts(infos: Sequence[Any]) -> dict[str, Any]:
+    """``verdicts``: share of each over all runs and updates, and ``certain``, that of ``localized``."""
+    words = np.concatenate([np.asarray(info.verdict).ravel() for info in infos])
+    shares = {verdict.name.lower(): float((words == verdict).mean()) for verdict in Verdict}
+    return {"verdicts": shares, "certain": shares["localized"]}
 
 
 def judged_by(method: str) -> str:

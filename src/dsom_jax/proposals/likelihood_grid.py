@@ -172,14 +172,19 @@ def free_blocks(grid: OccupancyGrid, coarse: OccupancyGrid) -> Array:
 
 @jax.jit
 def _viewpoints(grid: OccupancyGrid, coarse: OccupancyGrid, blocks: Array, cells: Array) -> Array:
-    """(C, 2) metres in the grid's frame: centre of the free old cell nearest to the centre of each new cell."""
+    """(C, 2) metres in the grid's frame: the centre of each new cell, or of the free old cell that is nearest to it.
+
+    Off the centre only where it must be: a viewpoint that always lies to one side of it makes places unequal that are.
+    """
     factor, cols = blocks.shape[1], coarse.shape[1]
     offset = jnp.arange(factor) - (factor - 1) / 2
-    far = jnp.where(blocks[cells], offset[:, None] ** 2 + offset**2, jnp.inf).reshape(len(cells), -1)
+    inside = blocks[cells]
+    far = jnp.where(inside, offset[:, None] ** 2 + offset**2, jnp.inf).reshape(len(cells), -1)
     best = jnp.argmin(far, -1)
-    j = (cells % cols) * factor + best % factor
-    i = (cells // cols) * factor + best // factor
-    return (jnp.stack([j, i], -1) + 0.5) * grid.resolution
+    i, j = jnp.divmod(cells, cols)
+    middle = jnp.stack([j, i], -1) * factor + factor / 2
+    nearest = jnp.stack([j * factor + best % factor, i * factor + best // factor], -1) + 0.5
+    return jnp.where(inside.all((1, 2))[:, None], middle, nearest) * grid.resolution
 
 
 @partial(jax.jit, static_argnames=("angles", "range_max"))

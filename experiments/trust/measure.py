@@ -1,0 +1,259 @@
+"""How often is an answer called localized, and is it then right? Real and spoilt logs, wrong maps, equal places.
+
+    python experiments/trust/measure.py --only clean half wrong --runs 10
+
+Every case is localized with a verdict (``adam_robust`` on the belief over the grid, 500 particles, 8 segments of 60
+updates); rows go to ``results.json``, one for each case, and are retained when the series goes on.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from worlds import LIDARS, building, fourfold, twofold
+
+from dsom_jax.belief.verdict import Verdict
+from dsom_jax.cli import parse
+from dsom_jax.data import RawLog, load_log, load_map, se2
+from dsom_jax.data.cut import segment_indices, splice, to_episode, without_repeats
+from dsom_jax.data.log import limited
+from dsom_jax.episode import Episode
+from dsom_jax.errors import run_cli
+from dsom_jax.filters.methods import DRAWN, REAL, Settings, make_filter, make_proposal, watch
+from dsom_jax.judging.metrics import ANGLE, POSITION, pose_error
+from dsom_jax.lidar import LidarConfig
+from dsom_jax.montecarlo import run, run_keys
+from dsom_jax.occupancy import OccupancyGrid, cell_index, lookup
+from dsom_jax.report import write_json
+from dsom_jax.simulate.drive import DriveConfig, make_synthetic
+
+HERE = Path(__file__).parent
+Spoil = Callable[[RawLog, np.random.Generator], RawLog]
+
+
+@dataclass(frozen=True)
+class Args:
+    """Measure verdicts."""
+
+    data: Path = Path(os.environ.get("DSOM_DATA") or HERE.parents[2] / "shared" / "data")
+    """Folder that holds a folder for each log."""
+    out: Path = HERE / "results.json"
+    """File of the rows."""
+    only: tuple[str, ...] = ()
+    """Groups: clean, kidnapped, half, plan, wrong, fault, crowd, glass, symmetric; default: all."""
+    runs: int = 10
+    """Runs of each segment."""
+    segments: int = 8
+    """Segments of each log."""
+    force: bool = False
+    """Measure again what has a row."""
+
+
+class Case(NamedTuple):
+    """What a filter believes in, and the drives."""
+
+    group: str
+    name: str
+    grid: OccupancyGrid
+    lidar: LidarConfig
+    episodes: list[Episode]
+    settings: Settings
+
+
+def turned(degrees: float) -> Spoil:
+    """A lidar that is turned by so much less than its driver says."""
+
+    def spoil(log: RawLog, rng: np.random.Generator) -> RawLog:
+        x, y, yaw = log.lidar.mount
+        return replace(log, lidar=replace(log.lidar, mount=(x, y, yaw - np.radians(degrees))))
+
+    return spoil
+
+
+def scaled(factor: float) -> Spoil:
+    """Ranges in another unit."""
+    return lambda log, rng: replace(log, ranges=log.ranges * np.float32(factor))
+
+
+def hidden(share: float, width: float, fill: Callable[..., np.ndarray]) -> Spoil:
+    """Sectors of ``width`` radians, ``share`` of all, in which ``fill(rng, ranges, number)`` is read."""
+
+    def spoil(log: RawLog, rng: np.random.Generator) -> RawLog:
+        shape, beams = log.ranges.shape, max(1, round(width / abs(log.lidar.angle_increment)))
+        count = -(-shape[1] // beams)
+        drawn = np.where(rng.random((shape[0], count)) < share, rng.uniform(0.01, 1, (shape[0], count)), 0.0)
+        drawn = np.repeat(drawn, beams, 1)[:, : shape[1]]
+        return replace(log, ranges=np.where(drawn > 0, fill(rng, log.ranges, drawn), log.ranges).astype(np.float32))
+
+    return spoil
+
+
+def people(rng: np.random.Generator, ranges: np.ndarray, number: np.ndarray) -> np.ndarray:
+    """Somebody at 0.5 to 3 m."""
+    before = 0.5 + 2.5 * number + rng.normal(0, 0.05, ranges.shape)
+    return np.minimum(np.where(np.isnan(ranges), np.inf, ranges), before)
+
+
+def panes(rng: np.random.Generator, ranges: np.ndarray, number: np.ndarray) -> np.ndarray:
+    """Half of it returns from behind the glass, half not at all."""
+    return np.where(rng.random(ranges.shape) < 0.5, np.inf, ranges + 3 * number)
+
+
+def other_way(log: RawLog, rng: np.random.Generator) -> RawLog:
+    """Odometry whose yaw has the wrong sign."""
+    poses = [log.odometry[0]]
+    for step in se2.relative(log.odometry[:-1], log.odometry[1:]) * (1, 1, -1):
+        poses.append(se2.compose(poses[-1], step))
+    return replace(log, odometry=np.array(poses))
+
+
+def widened(factor: float) -> Spoil:
+    """An angle between the beams that is wrong."""
+    return lambda log, rng: replace(
+        log, lidar=replace(log.lidar, angle_increment=log.lidar.angle_increment * factor)
+    )
+
+
+FAULTS: dict[str, Spoil] = {
+    "turned 180": turned(180),
+    "turned 90": turned(90),
+    "turned 10": turned(10),
+    "mirrored": lambda log, rng: replace(log, ranges=log.ranges[:, ::-1].copy()),
+    "upside down": lambda log, rng: replace(log, lidar=replace(log.lidar, upside_down=True)),
+    "ranges 0.9": scaled(0.9),
+    "ranges 1.1": scaled(1.1),
+    "increment 0.97": widened(0.97),
+    "yaw sign": other_way,
+}
+
+
+def main() -> None:
+    """Command line."""
+    args = parse(Args, "python experiments/trust/measure.py")
+    rows = json.loads(args.out.read_text()) if args.out.exists() else {}
+    for case in every(args):
+        name = f"{case.group}: {case.name}"
+        if (args.only and case.group not in args.only) or (name in rows and not args.force):
+            continue
+        began = time.perf_counter()
+        rows[name] = measure(case, args.runs) | {"runs": args.runs}
+        print(f"{name:44}", {k: v for k, v in rows[name].items() if v is not None},
+              f"{time.perf_counter() - began:.0f} s", flush=True)  # fmt: skip
+        write_json(args.out, rows)
+
+
+def every(args: Args) -> Iterator[Case]:
+    """All cases, logs read when their turn comes."""
+    rng = np.random.default_rng(0)
+
+    def case(group: str, name: str, place: str, source: str, spoil: Spoil | None = None, kidnap: bool = False) -> Case:
+        folder = args.data / source
+        log = limited(load_log(folder / "log.clf.gz", reference=folder / "reference.tum"), 25.0)
+        log = spoil(log, rng) if spoil else log
+        settings = DRAWN if "plan" in place or "walls" in place else REAL
+        episodes = cut(log, args.segments, kidnap)
+        return Case(group, name, load_map(map_of(args.data, place)), log.lidar, episodes, settings)
+
+    wanted = args.only or ("clean", "kidnapped", "half", "plan", "wrong", "fault", "crowd", "glass", "symmetric")
+    logs = ("intel", "freiburg-079", "freiburg-101", "edmonton")
+    if "clean" in wanted:
+        yield from (case("clean", log, log, log) for log in logs)
+    if "kidnapped" in wanted:
+        yield from (case("kidnapped", log, log, log, kidnap=True) for log in logs[:2])
+    if "half" in wanted:
+        yield from (case("half", log, log, log) for log in ("intel-half", "freiburg-079-half"))
+    if "plan" in wanted:
+        yield case("plan", "freiburg-079", "freiburg-079-walls-only", "freiburg-079")
+    if "wrong" in wanted:
+        for other in (*logs[1:], "upo_45", "elderly_center", "centre_sportif", "uva_lab", "willow"):
+            yield case("wrong", f"intel on {other}", other, "intel")
+        yield from (case("wrong", f"{log} on intel", "intel", log) for log in logs[1:])
+    if "fault" in wanted:
+        yield from (case("fault", f"{log} {name}", log, log, f) for log in logs[:2] for name, f in FAULTS.items())
+    if "crowd" in wanted:
+        for share in (0.4, 0.6):
+            yield from (case("crowd", f"{log} {share}", log, log, hidden(share, 0.26, people)) for log in logs[:2])
+    if "glass" in wanted:
+        yield from (case("glass", log, log, log, hidden(0.5, 0.09, panes)) for log in logs[:2])
+    if "symmetric" in wanted:
+        yield from (symmetric(seed) for seed in range(10))
+
+
+def map_of(data: Path, place: str) -> Path:
+    """The yaml of a map with or without a log."""
+    return data / place / "map.yaml" if (data / place).is_dir() else data / "maps" / f"{place}.yaml"
+
+
+def cut(log: RawLog, segments: int, kidnap: bool) -> list[Episode]:
+    """Segments of 60 updates; with ``kidnap`` each is followed by the one half the log further."""
+    pieces = [to_episode(log, rows) for rows in without_repeats(segment_indices(log, segments, 60))]
+    if not kidnap:
+        return pieces
+    others = pieces[len(pieces) // 2 :] + pieces[: len(pieces) // 2]
+    return [splice(a, b) for a, b in zip(pieces, others, strict=True)]
+
+
+def symmetric(seed: int) -> Case:
+    """A drive through a building that looks the same after half a turn, or after a quarter."""
+    from learn import SIMULATED
+
+    make, name = ((twofold, "two-fold"), (fourfold, "four-fold"))[seed % 2]
+    grid, lidar = make(building(900_000 + seed)), LIDARS[seed // 2 % 2]
+    drive = DriveConfig(updates=(60,), update_min_d=0.3, obstacles=0, removed=0, lidar=lidar)
+    _, episode = make_synthetic(900_000 + seed, grid, drive)
+    return Case("symmetric", f"{name} {seed}", grid, lidar, [episode], SIMULATED)
+
+
+def measure(case: Case, runs: int) -> dict[str, Any]:
+    """The row of a case."""
+    proposal = make_proposal("likelihood_grid", case.grid, case.lidar, case.settings)
+    filter = make_filter("adam_robust", proposal, case.grid, case.lidar, case.settings)
+    filter = watch(filter, case.grid, case.lidar, case.settings)
+    judged = [judge(case, n, run(filter, e, run_keys(0, n, runs)).info, e) for n, e in enumerate(case.episodes)]
+    pooled = {name: [j[name] for j in judged if j[name] is not None] for name in judged[0]}
+    return {name: round(float(np.mean(np.concatenate(v))), 4) if v else None for name, v in pooled.items()}
+
+
+def judge(case: Case, number: int, info: Any, episode: Episode) -> dict[str, np.ndarray | None]:
+    """What an episode adds to each mean of the row."""
+    e_pos, e_theta = (np.asarray(e) for e in pose_error(info.cluster, episode.poses))
+    wrong = (e_pos > POSITION) | (e_theta > ANGLE)
+    verdict, p = np.asarray(info.verdict), np.asarray(info.p_lost)
+    sure = verdict == Verdict.LOCALIZED
+    known = ~np.isnan(e_pos)
+    first = np.where(sure.any(1), sure.argmax(1), sure.shape[1]).astype(float)
+    found = (~wrong).argmax(1)[:, None] + 5 <= np.arange(sure.shape[1])
+    i, j = cell_index(case.grid, episode.poses)
+    free = np.broadcast_to(np.asarray(lookup(case.grid.free, i, j, outside=False)), sure.shape)
+    moved = np.flatnonzero(np.asarray(episode.kidnapped))
+    left = [(~sure[:, t : t + 3]).any(1) for t in moved if t > 0]
+    weights = np.sort(np.asarray(info.hypotheses.weights), -1)[..., ::-1]
+    fold = {"two": 2, "fou": 4}.get(case.name[:3])
+    even = None
+    if fold:
+        even = (weights[..., 0] < 2 * weights[..., fold - 1]).ravel()
+    return {
+        "wrong": wrong[known],
+        "certain": sure[known],
+        "false_confident": (sure & wrong)[known],
+        "first_localized": first,
+        "certain_when_found": sure[known & found],
+        "certain_on_map": sure[known & free],
+        "p_lost_wrong": p[known & wrong] if (known & wrong).any() else None,
+        "p_lost_right": p[known & ~wrong] if (known & ~wrong).any() else None,
+        "left_in_2": np.concatenate(left) if left else None,
+        "strict": (e_pos[:, -1] < 0.5) & (e_theta[:, -1] < np.radians(5)),
+        "error": np.median(e_pos[known & ~wrong])[None] if (known & ~wrong).any() else None,
+        "even": even,
+    }
+
+
+if __name__ == "__main__":
+    run_cli(main)

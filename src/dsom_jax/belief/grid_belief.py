@@ -1,0 +1,452 @@
+"""Which place: grid localization (Probabilistic Robotics, Table 8.1) that knows a place off the map, and looks where
+the mass is.
+
+The belief is a mass for each free cell and heading, and one for "not on this map". Every update moves it by the
+odometry and multiplies it by what the scan says. While nearly all of it lies in a few cells, only these and those that
+they can reach are moved and judged; as soon as the scan speaks against all of them, the whole grid is judged again.
+
+What is exact and what is not: moving and judging are Bayes' rule on the cells, for the beam model to a power (the
+temper), as neighbouring beams and scans taken one after another err alike. What a focus leaves out is at most
+``_SPILT`` of the mass at each update. A scan counts as much as it is new (:func:`novelty`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dsom_jax import checks
+from dsom_jax import pose_grid as pg
+from dsom_jax.geometry import compose, rotate
+from dsom_jax.occupancy import OccupancyGrid, dilate, pad
+from dsom_jax.proposals.likelihood_grid import LikelihoodGrid, _columns, _sum_terms, _term_table, beam_choice
+from dsom_jax.resampling import pick, pick_in_rows
+from dsom_jax.types import Array, Inputs, Key
+
+_SPILT = 1e-4
+"""Mass outside of the focus above which there is none."""
+_FAINT = 1e-7
+"""Share of the mass below which a row is empty."""
+_AWAY = 0.02
+"""Mass off the map from which on the whole grid is judged."""
+_EVEN = np.array([0.6180339887, 0.7548776662, 0.5698402910])
+"""Multiples of these, modulo one, lie evenly in a cube."""
+_NEWS = 0.25
+"""Novelty of a scan below which the belief waits for more."""
+
+
+@dataclass(frozen=True)
+class GridBeliefConfig:
+    """How the belief moves and what it believes of a scan (static).
+
+    Attributes:
+        beams: beams that are judged, spread evenly over the scan.
+        temper: factor on a scan's log-likelihood.
+        kidnap: probability of being carried anywhere between two updates.
+        slip: probability that the robot stood still, or drove back what the odometry reports as forth.
+        leave: probability of leaving the map at an update, beside what is seen to leave it.
+        enter: probability of coming back to it.
+        explained: off the map a scan is as likely as on it where the map explains this share of the beams; of cells
+            and heading bins, so that even the right one explains half of a clean scan.
+        fits: log-likelihood of a beam below which a focus is not trusted, and the whole grid judged.
+        rows: number of cells that a focus holds.
+        reach: cells around where the odometry takes the mass that the focus goes on to hold.
+        pool: cells that are drawn to stand for the belief.
+        samples: how many of them tell places apart.
+    """
+
+    beams: int = 60
+    temper: float = 0.1
+    kidnap: float = 1e-9
+    slip: float = 0.1
+    leave: float = 1e-4
+    enter: float = 0.02
+    explained: float = 0.2
+    fits: float = -1.7
+    rows: int = 384
+    reach: int = 3
+    pool: int = 2048
+    samples: int = 512
+
+    def __post_init__(self) -> None:
+        checks.count(self, "beams rows reach pool samples")
+        checks.positive(self, "temper")
+        checks.share(self, "kidnap leave enter explained", excluding="()")
+        checks.share(self, "slip", excluding=")")
+        checks.finite(self, "fits")
+
+
+class Pool(NamedTuple):
+    """Cells that stand for a belief, each with 1 / P of its mass.
+
+    Attributes:
+        cell: (P,) flat (i, j) of the likelihood grid.
+        heading: (P,) k.
+        log_prior, log_posterior: (P,) log density in 1 / (m^2 rad) there, before and after the scan, of a belief that
+            knows nothing off the map.
+    """
+
+    cell: Array
+    heading: Array
+    log_prior: Array
+    log_posterior: Array
+
+
+class Memory(NamedTuple):
+    """The belief after an update.
+
+    Attributes:
+        mass: (C, K) by free cell and heading; means nothing while the belief is focused.
+        rows: (M,) cells of the focus, C where there are fewer.
+        focus: (M, K) mass of these; all that there is on the map while the belief is focused.
+        focused: () bool, nearly all mass lies in ``rows``, and the scan fits there.
+        off: () mass off the map; all of it sums to one.
+        pool: what was drawn of it.
+        scan: (B,) the last one that counted, to tell what is new in the next.
+        pending: (3,) motion since then, in the base frame of then.
+    """
+
+    mass: Array
+    rows: Array
+    focus: Array
+    focused: Array
+    off: Array
+    pool: Pool
+    scan: Array
+    pending: Array
+
+
+class Places(NamedTuple):
+    """What an update makes of the belief, for particles and for the verdict.
+
+    Attributes:
+        pool: cells that stand for it.
+        poses: (S, 3) base poses of some of them, each with 1 / S of the mass on the map.
+        off: () mass off the map.
+        novelty: () how much of the scan counted.
+    """
+
+    pool: Pool
+    poses: Array
+    off: Array
+    novelty: Array
+
+
+class _Judged(NamedTuple):
+    """The belief after one way of updating it; ``level`` () is the mean evidence of a beam."""
+
+    mass: Array
+    rows: Array
+    focus: Array
+    focused: Array
+    off: Array
+    pool: Pool
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class GridBelief:
+    """Proposal that draws from the belief after all scans so far.
+
+    Attributes:
+        likelihood: cells, expected ranges and sensor model.
+        row_of: (H * W + 1,) row of each cell in the belief, C for what is not free.
+        frontier: (C, 1) share of those who enter the map that come in here.
+        config: static.
+    """
+
+    likelihood: LikelihoodGrid
+    row_of: Array
+    frontier: Array
+    config: GridBeliefConfig = field(default=GridBeliefConfig(), metadata={"static": True})
+
+    def begin(self) -> Memory:
+        """Belief before the first update: even over free space."""
+        count, headings = self._shape
+        nothing = jnp.zeros(self.config.pool)
+        pool = Pool(nothing.astype(jnp.int32), nothing.astype(jnp.int32), nothing, nothing)
+        rows = jnp.full(self.config.rows, count, jnp.int32)
+        scan = jnp.full(self.likelihood.lidar.beams, jnp.nan)
+        focus = jnp.zeros((self.config.rows, headings))
+        return Memory(self._even(), rows, focus, jnp.bool_(False), jnp.float32(0.0), pool, scan, jnp.zeros(3))
+
+    @property
+    def _shape(self) -> tuple[int, int]:
+        return self.likelihood.cells.size, self.likelihood.config.headings
+
+    def _real(self) -> Array:
+        """Which of the cells (C, 1) are cells, not filling, as numbers."""
+        return (self.likelihood.cells < self.likelihood.free.size)[:, None].astype(jnp.float32)
+
+    def _even(self) -> Array:
+        """(C, K) the same mass everywhere."""
+        return jnp.broadcast_to(self._real() / jnp.maximum(self._real().sum() * self._shape[1], 1), self._shape)
+
+    def prepare(self, memory: Memory, inputs: Inputs) -> tuple[Places, Memory]:
+        """Belief of the update before -> what this one makes of it, and its belief."""
+        first = inputs.index == 0
+        told = jnp.where(jnp.isfinite(inputs.odometry).all() & ~first, inputs.odometry, 0.0)
+        odometry = compose(memory.pending, told)
+        fresh = jnp.where(first, 1.0, novelty(memory.scan, inputs.ranges, odometry))
+        counts = fresh > _NEWS
+        rows, fits = self._reachable(memory, odometry)
+        near = memory.focused & fits & ~first
+        way = jnp.where(counts, jnp.where(near, 1, 2), 0)
+        judged = jax.lax.switch(
+            way, (self._held, self._near, self._everywhere), memory, rows, odometry, inputs.ranges, fresh
+        )
+        scan, pending = jnp.where(counts, inputs.ranges, memory.scan), jnp.where(counts, 0.0, odometry)
+        stride = max(1, self.config.pool // self.config.samples)
+        some = jax.tree.map(lambda v: v[::stride], judged.pool)
+        poses, _, _ = self._poses(some, (jnp.arange(some.cell.size)[:, None] * _EVEN) % 1.0)
+        places = Places(judged.pool, poses, judged.off, jnp.where(counts, fresh, 0.0))
+        return places, Memory(*judged, scan, pending)
+
+    def _held(self, memory: Memory, rows: Array, odometry: Array, ranges: Array, fresh: Array) -> _Judged:
+        """Nothing new: the belief as it was."""
+        pool = memory.pool._replace(log_prior=memory.pool.log_posterior)
+        return _Judged(memory.mass, memory.rows, memory.focus, memory.focused, memory.off, pool)
+
+    def _near(self, memory: Memory, rows: Array, odometry: Array, ranges: Array, fresh: Array) -> _Judged:
+        """All mass stays within ``rows`` (M,), the cells that it can reach."""
+        count, size = self._shape[0], self.row_of.size
+        cells = self.likelihood.cells.at[rows].get(mode="fill", fill_value=size - 1)
+        old = self.likelihood.cells.at[memory.rows].get(mode="fill", fill_value=size)
+        slot = jnp.full(size, self.config.rows, jnp.int32).at[old].set(jnp.arange(self.config.rows), mode="drop")
+        moved = self._moved(memory.focus, slot, cells, odometry)
+        # Where all of it would leave free space, it stays near.
+        moved = jnp.where((rows < count)[:, None], moved + 1e-12, 0.0)
+        away = self._away(memory)
+        prior = (1 - away) * normalised(moved)
+        posterior, off, level = self._bayes(prior, away, self._evidence(ranges, rows), ranges, fresh)
+        focused = (off < _AWAY) & (level > self.config.fits)
+        # Rows that have become empty need no following.
+        by_row = posterior.sum(-1)
+        rows = jnp.where(by_row > _FAINT, rows, count)
+        focus = jnp.where((rows < count)[:, None], posterior, 0.0)
+        return _Judged(memory.mass, rows, focus, focused, off, self._draw(cells, prior, posterior))._replace(
+            mass=jax.lax.cond(focused, lambda: memory.mass, lambda: self._spread(rows, focus))
+        )
+
+    def _everywhere(self, memory: Memory, rows: Array, odometry: Array, ranges: Array, fresh: Array) -> _Judged:
+        """All cells moved and judged; here those who are carried away, or come back, come down."""
+        mass = jax.lax.cond(memory.focused, lambda: self._spread(memory.rows, memory.focus), lambda: memory.mass)
+        moved = jax.lax.cond(
+            (odometry == 0).all(),
+            lambda: mass,
+            lambda: self._moved(self._laid_out(mass), None, self.likelihood.cells, odometry) * self._real(),
+        )
+        away, even = self._away(memory), self._even()
+        back = memory.off * self.config.enter / 2 * (even + self.frontier / self._shape[1])
+        prior = (1 - away) * normalised((1 - memory.off) * normalised(moved) + back + self.config.kidnap * even)
+        posterior, off, level = self._bayes(prior, away, self._evidence(ranges, None), ranges, fresh)
+        by_row = posterior.sum(-1)
+        holds = by_row > _FAINT * by_row.sum()
+        rows = jnp.flatnonzero(holds, size=self.config.rows, fill_value=self._shape[0]).astype(jnp.int32)
+        held = jnp.where(holds, by_row, 0.0).sum() >= (1 - _SPILT) * by_row.sum()
+        focused = held & (holds.sum() <= self.config.rows) & (off < _AWAY) & (level > self.config.fits)
+        focus = posterior.at[rows].get(mode="fill", fill_value=0.0)
+        pool = self._draw(self.likelihood.cells, prior, posterior)
+        return _Judged(posterior, rows, focus, focused, off, pool)
+
+    def _spread(self, rows: Array, focus: Array) -> Array:
+        """(C, K) of the masses (M, K) of a focus."""
+        return jnp.zeros(self._shape).at[rows].set(focus, mode="drop")
+
+    def _away(self, memory: Memory) -> Array:
+        """Mass off the map before the scan."""
+        return memory.off * (1 - self.config.enter) + (1 - memory.off) * self.config.leave
+
+    def _bayes(
+        self, prior: Array, away: Array, evidence: Array, ranges: Array, fresh: Array
+    ) -> tuple[Array, Array, Array]:
+        """Masses (n, K) and () after the scan, which sum to one, and the mean evidence of a beam on the map ()."""
+        valid = (ranges[self._beams()] > -jnp.inf).sum()
+        scale = fresh * self.config.temper
+        log_on, log_off = jnp.log(prior) + scale * evidence, jnp.log(away) + scale * self._unmapped() * valid
+        top = log_on.max()
+        on = pg.exp_or_zero(log_on - top)
+        total = on.sum()
+        # A little of both is always left: neither is ever impossible for good.
+        off = jnp.clip(jax.nn.sigmoid(log_off - top - jnp.log(total)), 0.0, 1 - 1e-6)
+        level = jnp.where(on > 0, on * evidence, 0.0).sum() / total / jnp.maximum(valid, 1)
+        return (1 - off) / total * on, off, level
+
+    def _unmapped(self) -> float:
+        """Log-likelihood of a beam off the map: hits that are a deviation off, and readings that no wall explains."""
+        model = self.likelihood.config.model
+        hit = model.z_hit * math.exp(-0.5) / (model.sigma_hit * math.sqrt(2 * math.pi))
+        other = (4 * model.z_short + model.z_rand) / model.range_max
+        share = self.config.explained
+        return share * math.log(hit + other) + (1 - share) * math.log(other)
+
+    def _beams(self) -> Any:
+        return beam_choice(self.likelihood.lidar.beams, self.config.beams)
+
+    def _evidence(self, ranges: Array, rows: Array | None) -> Array:
+        """(n, K) log p(z | x), untempered, at ``rows`` (n,), or at all cells."""
+        likelihood, beams = self.likelihood, self._beams()
+        expected = likelihood.expected if rows is None else likelihood.expected.at[:, rows].get(mode="clip")
+        columns = _columns(likelihood.lidar.angles()[beams], likelihood.config)
+        return _sum_terms(expected, _term_table(ranges[beams], likelihood.config.model), columns)
+
+    def _swing(self, odometry: Array) -> Array:
+        """Metres that a turn of the base moves a sensor beside its axle."""
+        x, y, _ = self.likelihood.lidar.mount
+        return math.hypot(x, y) * jnp.abs(odometry[2])
+
+    def _laid_out(self, mass: Array) -> Array:
+        """(H * W, K) of masses (C, K): a cell's neighbours are then found without looking them up."""
+        return jnp.zeros((self.row_of.size - 1, mass.shape[1])).at[self.likelihood.cells].set(mass, mode="drop")
+
+    def _moved(self, mass: Array, slot: Array | None, cells: Array, odometry: Array) -> Array:
+        """Mass (n, K) that a body-frame increment (3,) brings to ``cells`` (n,); what leaves free space is lost.
+
+        ``mass`` (m, K) is that of the cells for which ``slot`` (H * W + 1,) says a row, or of all (H * W, K).
+        """
+        grid = self.likelihood.pose_grid
+        mount = jnp.array(self.likelihood.lidar.mount)[:2]
+        swing = jnp.stack(rotate(odometry[2], *mount)) - mount
+        theta = pg.heading(grid, jnp.arange(grid.headings))
+        padded = jnp.pad(mass, ((0, 1), (0, 0)))
+        forth, back = (
+            jnp.stack(rotate(theta, *step)[::-1]) / grid.resolution
+            for step in (swing + odometry[:2], swing - odometry[:2])
+        )
+        moved = (1 - self.config.slip) * self._shifted(padded, slot, cells, forth)
+        # Slips are rare and need no interpolation.
+        slipped = self._taken(padded, slot, cells, jnp.round(back).astype(jnp.int32))
+        slipped = slipped + self._taken(padded, slot, cells, jnp.zeros_like(back, jnp.int32))
+        return turned(moved + self.config.slip / 2 * slipped, odometry[2] / grid.turn)
+
+    def _shifted(self, padded: Array, slot: Array | None, cells: Array, shift: Array) -> Array:
+        """Mass (n, K) at ``cells`` after heading k moved by ``shift`` (2, K) cells along y and x."""
+        (rows, of_row), (cols, of_col) = (spline(s) for s in shift)
+        total = jnp.zeros((cells.size, padded.shape[1]))
+        for a in range(3):
+            for b in range(3):
+                part = self._taken(padded, slot, cells, jnp.stack([rows + a - 1, cols + b - 1]))
+                total += of_row[a] * of_col[b] * part
+        return total
+
+    def _taken(self, padded: Array, slot: Array | None, cells: Array, shift: Array) -> Array:
+        """Mass (n, K) that lay ``shift`` (2, K) whole cells before ``cells`` (n,); the last row of ``padded`` is 0."""
+        grid = self.likelihood.pose_grid
+        i, j = jnp.divmod(cells, grid.width)
+        y, x = i[:, None] - shift[0], j[:, None] - shift[1]
+        inside = (y >= 0) & (y < grid.height) & (x >= 0) & (x < grid.width)
+        cell = jnp.where(inside, y * grid.width + x, grid.height * grid.width)
+        row = cell if slot is None else slot.at[cell].get(mode="promise_in_bounds")
+        headings = jnp.arange(grid.headings)
+        return padded.reshape(-1).at[row * grid.headings + headings].get(mode="promise_in_bounds")
+
+    def _reachable(self, memory: Memory, odometry: Array) -> tuple[Array, Array]:
+        """Rows (M,) that the mass of the focus can reach in one update, and whether they are all there."""
+        grid = self.likelihood.pose_grid
+        cells = self.likelihood.cells.at[memory.rows].get(mode="fill", fill_value=grid.height * grid.width)
+        i, j = jnp.divmod(cells, grid.width)
+        heading = pg.heading(grid, jnp.argmax(memory.focus, -1))
+        across, along = (v / grid.resolution for v in rotate(heading, odometry[0], odometry[1])[::-1])
+        image = jnp.zeros((grid.height, grid.width), bool)
+        for way in (1.0, -1.0, 0.0):
+            y, x = jnp.round(i + way * across).astype(jnp.int32), jnp.round(j + way * along).astype(jnp.int32)
+            there = (cells < grid.height * grid.width) & (y >= 0) & (x >= 0)
+            image = image.at[jnp.where(there, y, grid.height), x].set(True, mode="drop")
+        image = dilate(image, self.config.reach) & self.likelihood.free
+        cells = jnp.flatnonzero(image, size=self.config.rows, fill_value=grid.height * grid.width)
+        swings = self._swing(odometry) >= (self.config.reach - 2) * grid.resolution
+        return self.row_of[cells], (image.sum() <= self.config.rows) & ~swings
+
+    def _draw(self, cells: Array, prior: Array, posterior: Array) -> Pool:
+        """Cells drawn by the posterior (n, K) of ``cells`` (n,), one stratum each along the cells."""
+        n = self.config.pool
+        by_row = posterior.sum(-1)
+        row = pick(jnp.cumsum(by_row), (jnp.arange(n) + 0.5) / n)
+        within = jnp.cumsum(posterior[row], -1)
+        k = pick_in_rows(within, jnp.arange(n), (jnp.arange(n) * _EVEN[0]) % 1.0)
+        cell = cells[row]
+        volume = self.likelihood.map_cells.log_cell_volume
+        volume = volume + jnp.log(self.likelihood.parts.at[cell, -1].get(mode="clip").astype(jnp.float32))
+        log_prior = jnp.log(prior[row, k] / prior.sum()) - volume
+        return Pool(cell, k, log_prior, jnp.log(posterior[row, k] / by_row.sum()) - volume)
+
+    def _poses(self, pool: Pool, u: Array) -> tuple[Array, Array, Array]:
+        """Base poses (n, 3) within the free space of cells, by ``u`` (n, 3) in [0, 1), and their log densities (n,)."""
+        likelihood = self.likelihood
+        # One number chooses the free part, and what is left of it the place in there.
+        part = pick_in_rows(likelihood.parts, pool.cell, u[:, 0])
+        along = (u[:, 0] * likelihood.parts[pool.cell, -1]) % 1.0
+        side = likelihood.map_cells.height // likelihood.pose_grid.height
+        pairs = zip(divmod(pool.cell, likelihood.pose_grid.width), divmod(part, side), strict=True)
+        i, j = (whole * side + inner for whole, inner in pairs)
+        poses = pg.cell_pose(likelihood.map_cells, i + along - 0.5, j + u[:, 1] - 0.5, pool.heading + u[:, 2] - 0.5)
+        x, y, _ = likelihood.lidar.mount
+        return compose(poses, jnp.array([-x, -y, 0.0])), pool.log_prior, pool.log_posterior
+
+    def sample(self, key: Key, prepared: Places, n: int) -> tuple[Array, Array]:
+        """``n`` base poses (n, 3) from the belief after the scan, and their log densities."""
+        poses, _, log_q = self.draw(key, prepared, n)
+        return poses, log_q
+
+    def draw(self, key: Key, prepared: Places, n: int) -> tuple[Array, Array, Array]:
+        """As :meth:`sample`; between the two the log densities (n,) of the belief before the scan."""
+        k_which, k_where = jax.random.split(key)
+        which = jnp.floor((jnp.arange(n) + jax.random.uniform(k_which)) * (self.config.pool / n)).astype(jnp.int32)
+        which = jnp.minimum(which, self.config.pool - 1)
+        return self._poses(jax.tree.map(lambda v: v[which], prepared.pool), jax.random.uniform(k_where, (n, 3)))
+
+
+def grid_belief(likelihood: LikelihoodGrid, grid: OccupancyGrid, config: GridBeliefConfig) -> GridBelief:
+    """Belief on the cells of a likelihood grid that was made for the map ``grid``."""
+    cells, size = likelihood.cells, likelihood.free.size
+    number = jnp.arange(cells.size, dtype=jnp.int32)
+    row_of = jnp.full(size + 1, cells.size, jnp.int32).at[cells].set(number, mode="drop")
+    at_edge = (dilate(_unknown(likelihood, grid), 2) & likelihood.free).reshape(-1)
+    frontier = at_edge.at[cells].get(mode="fill", fill_value=False).astype(jnp.float32)[:, None]
+    return GridBelief(likelihood, row_of, normalised(frontier), config)
+
+
+def _unknown(likelihood: LikelihoodGrid, grid: OccupancyGrid) -> Array:
+    """(H, W) bool, cells of the likelihood grid in which some cell of the map is neither free nor occupied."""
+    rows, cols = likelihood.free.shape
+    side = likelihood.map_cells.height // rows
+    blank = ~(pad(grid, (rows * side, cols * side)).free | pad(grid, (rows * side, cols * side)).occupied)
+    return blank.reshape(rows, side, cols, side).any((1, 3))
+
+
+def novelty(before: Array, now: Array, odometry: Array) -> Array:
+    """Share () of a scan (B,) that counts: all of it after a quarter of a metre or 0.2 rad, or where it has changed."""
+    moved = jnp.hypot(odometry[0], odometry[1]) / 0.25 + jnp.abs(odometry[2]) / 0.2
+    both = jnp.isfinite(before) & jnp.isfinite(now)
+    gap = jnp.abs(jnp.where(both, before, 0.0) - jnp.where(both, now, 0.0)) > 0.3
+    judged = (before > -jnp.inf) & (now > -jnp.inf)
+    changed = jnp.where(both, gap, jnp.isfinite(before) != jnp.isfinite(now)) & judged
+    share = changed.sum() / jnp.maximum(judged.sum(), 1)
+    return jnp.clip(jnp.maximum(moved, (share - 0.2) / 0.3), 0.0, 1.0)
+
+
+def normalised(mass: Array) -> Array:
+    """Masses of sum one."""
+    return mass / jnp.maximum(mass.sum(), 1e-30)
+
+
+def spline(offset: Array) -> tuple[Array, Array]:
+    """Nearest whole number () to ``offset`` and the weights (3, ...) of it and its neighbours.
+
+    Quadratic B-splines: interpolation and a blur with standard deviation half a cell in one.
+    """
+    whole = jnp.round(offset)
+    rest = offset - whole
+    weights = jnp.stack([0.5 * (0.5 - rest) ** 2, 0.75 - rest**2, 0.5 * (0.5 + rest) ** 2])
+    return whole.astype(jnp.int32), weights
+
+
+def turned(belief: Array, bins: Array) -> Array:
+    """Belief (n, K) turned by a number of heading bins ()."""
+    whole, weights = spline(bins)
+    return jnp.stack([w * jnp.roll(belief, whole + a - 1, axis=1) for a, w in enumerate(weights)]).sum(0)

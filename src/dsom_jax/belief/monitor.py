@@ -1,0 +1,219 @@
+"""What speaks for and against an answer: the scan against the map at the answer, the drive against the odometry, the
+belief's share of the place. Features of :mod:`dsom_jax.belief.verdict`, computed for any filter.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from dsom_jax.geometry import relative, wrap_angle
+from dsom_jax.lidar import LidarConfig
+from dsom_jax.marching import empty_squares
+from dsom_jax.raycast import MapTables, cast_rays
+from dsom_jax.types import Array
+
+_TOLERANCE = 0.3
+"""Metres within which a return is where the map has a wall."""
+
+
+class Fit(NamedTuple):
+    """How a scan fits the map at a pose, as shares.
+
+    Attributes:
+        hit, short, long: of the beams whose way lies in known space: those that end where the map has a wall, before
+            it, and behind it. They sum to one; without any such beam they are 0.
+        unknown: of the valid beams, those whose way leads through unknown space.
+        known: of all beams, those that count for ``hit``, ``short`` and ``long``.
+    """
+
+    hit: Array
+    short: Array
+    long: Array
+    unknown: Array
+    known: Array
+
+
+def fit(ranges: Array, expected: Array, seen: Array, range_max: float) -> Fit:
+    """Fit of a scan (..., B) to the expected ranges and to the ranges at which known space ends (..., B).
+
+    Neighbouring beams lend their expected ranges: at an edge either wall will do. A beam without return where no
+    wall is expected says nothing.
+    """
+    cut = lambda r: jnp.minimum(r, range_max)  # noqa: E731
+    z, wall, edge = cut(ranges), cut(expected), cut(seen)
+    around = jnp.stack([jnp.roll(wall, 1, -1), wall, jnp.roll(wall, -1, -1)])
+    nearest, farthest = around.min(0), around.max(0)
+    valid = ranges > -jnp.inf
+    unknown = valid & (edge < jnp.minimum(z, nearest) - _TOLERANCE)
+    empty = jnp.isposinf(ranges) & (wall >= range_max)
+    judged = valid & ~unknown & ~empty
+    short, long = judged & (z < nearest - _TOLERANCE), judged & (z > farthest + _TOLERANCE)
+    count = judged.sum(-1)
+    share = lambda what, whole: what.sum(-1) / jnp.maximum(whole, 1)  # noqa: E731
+    hit = judged & ~short & ~long
+    return Fit(share(hit, count), share(short, count), share(long, count),
+               share(unknown, valid.sum(-1)), count / ranges.shape[-1])  # fmt: skip
+
+
+class Track(NamedTuple):
+    """What a monitor remembers of one run; sums fade, so that each stands for about the last ten updates.
+
+    Attributes:
+        pose: (3,) the last answer.
+        fit: (5,) faded sums of what :class:`Fit` holds, by known beams, and ``weight`` () of all of it.
+        cross, along, squared: () faded sums of reported x answered steps: crosswise, along, and of the reported ones.
+        slide, turn: () faded sums of squared gaps between reported and answered steps (m^2) and turns (rad^2).
+        count: () faded number of steps.
+        jump: () faded number of steps that no odometry explains.
+    """
+
+    pose: Array
+    fit: Array
+    weight: Array
+    cross: Array
+    along: Array
+    squared: Array
+    slide: Array
+    turn: Array
+    count: Array
+    jump: Array
+
+
+class Signs(NamedTuple):
+    """What speaks against an answer; each is 0 where all is well and grows with doubt, () each.
+
+    Attributes:
+        elsewhere: share of the belief that is not at the answer's place.
+        scattered: share of the particles' weight that is not there.
+        miss, long: share of the beams that do not end at a mapped wall, and that went through one; faded.
+        miss_now, long_now: the same, of this scan alone.
+        unknown: share of the beams that look into unknown space; faded.
+        blind: share of the beams that say nothing, faded.
+        crab: angle between the reported steps and the answered ones, radians.
+        stretch: by what share answered steps are longer or shorter than reported ones.
+        slide: reported and answered steps differ by this share of a step.
+        turn: root mean square of the gap between reported and answered turns, radians.
+        jump: recent steps that no odometry explains.
+        fresh: 1 at the first update, fading.
+    """
+
+    elsewhere: Array
+    scattered: Array
+    miss: Array
+    long: Array
+    miss_now: Array
+    long_now: Array
+    unknown: Array
+    blind: Array
+    crab: Array
+    stretch: Array
+    slide: Array
+    turn: Array
+    jump: Array
+    fresh: Array
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Monitor:
+    """Watches the answers of a filter.
+
+    Attributes:
+        tables: the map.
+        seen: the map whose unknown cells stop rays, too.
+        lidar: beams that are looked at (static); every ``beam_step``-th of the scan (static).
+        fade, slow: share of the past that an update keeps, of fits and of steps (static).
+    """
+
+    tables: MapTables
+    seen: MapTables
+    lidar: LidarConfig = field(metadata={"static": True})
+    beam_step: int = field(metadata={"static": True})
+    fade: float = field(default=0.7, metadata={"static": True})
+    slow: float = field(default=0.9, metadata={"static": True})
+
+    def start(self) -> Track:
+        """Nothing seen."""
+        zero = jnp.float32(0.0)
+        return Track(jnp.zeros(3), jnp.zeros(5), *[zero] * 8)
+
+    def watch(
+        self,
+        track: Track,
+        answer: Array,
+        ranges: Array,
+        odometry: Array,
+        first: Array,
+        elsewhere: Array,
+        scattered: Array,
+    ) -> tuple[Track, Signs]:
+        """One update of one run: ``answer`` (3,), ``ranges`` (B,) of the whole scan, ``odometry`` (3,)."""
+        now = fit(
+            ranges[:: self.beam_step],
+            cast_rays(self.tables, answer, self.lidar),
+            cast_rays(self.seen, answer, self.lidar),
+            self.lidar.range_max,
+        )
+        track = self._stepped(track, answer, odometry, first)
+        keep = jnp.where(first, 0.0, self.fade)
+        counts = jnp.stack([now.hit * now.known, now.short * now.known, now.long * now.known, now.unknown, now.known])
+        track = track._replace(pose=answer, fit=keep * track.fit + counts, weight=keep * track.weight + 1)
+        return track, self._signs(track, now, elsewhere, scattered)
+
+    def _stepped(self, track: Track, answer: Array, odometry: Array, first: Array) -> Track:
+        """Reported against answered step; both along the mean heading, so that a wrong turn is not a wrong way."""
+        step = relative(track.pose, answer)
+        gap = wrap_angle(step[2] - odometry[2])
+        c, s = jnp.cos(gap / 2), jnp.sin(gap / 2)
+        x, y = c * step[0] + s * step[1], c * step[1] - s * step[0]
+        off = jnp.hypot(x - odometry[0], y - odometry[1])
+        travel = jnp.hypot(odometry[0], odometry[1])
+        jumped = (off > jnp.maximum(1.0, 2.5 * travel)) | (jnp.abs(gap) > 0.7)
+        keep = jnp.where(first, 0.0, self.slow)
+        use = jnp.where(first | jumped | ~jnp.isfinite(odometry).all(), 0.0, 1.0)
+        told = jnp.where(jnp.isfinite(odometry), odometry, 0.0)
+        return track._replace(
+            cross=keep * track.cross + use * (told[0] * y - told[1] * x),
+            along=keep * track.along + use * (told[0] * x + told[1] * y),
+            squared=keep * track.squared + use * travel**2,
+            slide=keep * track.slide + use * jnp.where(use > 0, off, 0.0) ** 2,
+            turn=keep * track.turn + use * gap**2,
+            count=keep * track.count + use,
+            jump=jnp.where(first, 0.0, 0.8 * track.jump) + jnp.where(first, 0.0, jumped),
+        )
+
+    def _signs(self, track: Track, now: Fit, elsewhere: Array, scattered: Array) -> Signs:
+        hit, short, long, unknown, known = track.fit / track.weight
+        total = jnp.maximum(hit + short + long, 1e-6)
+        steps = track.squared / jnp.maximum(track.count, 1e-6)
+        sure = track.squared / (track.squared + 0.1)
+        crab = jnp.arctan2(jnp.abs(track.cross), track.along)
+        ratio = track.along / jnp.maximum(track.squared, 1e-6)
+        return Signs(
+            elsewhere=elsewhere,
+            scattered=scattered,
+            miss=(short + long) / total,
+            long=long / total,
+            miss_now=now.short + now.long,
+            long_now=now.long,
+            unknown=unknown,
+            blind=1 - known,
+            crab=sure * crab,
+            stretch=sure * jnp.abs(ratio - 1),
+            slide=sure * jnp.sqrt(track.slide / jnp.maximum(track.count, 1e-6) / (steps + 0.01)),
+            turn=jnp.sqrt(track.turn / jnp.maximum(track.count, 1.0)),
+            jump=track.jump,
+            fresh=jnp.exp(-track.count),
+        )
+
+
+def monitor(tables: MapTables, lidar: LidarConfig, beams: int = 120) -> Monitor:
+    """Monitor on a map, looking at about ``beams`` beams of a scan."""
+    step = max(1, lidar.beams // beams)
+    grid = replace(tables.grid, occupied=~tables.grid.free)
+    squares = empty_squares(jnp.pad(grid.occupied, 1, constant_values=True), 63)
+    return Monitor(tables, replace(tables, grid=grid, squares=squares, walls=None), lidar.every(step), step)
