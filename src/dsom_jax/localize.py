@@ -32,7 +32,6 @@ from dsom_jax.judging.scores import Drive, Outcome, Replies, judged_by, replies,
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.montecarlo import run, run_keys
 from dsom_jax.occupancy import OccupancyGrid
-from dsom_jax.types import Filter
 from dsom_jax.view.localized import write_view
 
 
@@ -282,6 +281,7 @@ def summary_of(
         "ms_per_update": 1e3 * float(np.median([o.seconds / len(o.drive.stamps) for o in timed])),
     }  # fmt: skip
     head |= verdicts([o.result.info for o in outcomes])
+    head["confident"] = head["certain"]
     given = [replies(o.result.info, judged_by(args.method)) for o in outcomes]
     drives, rooms = [o.drive for o in outcomes], rooms_of(grid)
 
