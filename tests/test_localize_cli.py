@@ -55,6 +55,7 @@ def test_with_reference(call, room, tmp_path):
     assert not wrong
     assert (summary["map"], summary["log"]) == (str(room.map), str(room.log))
     assert (summary["method"], summary["proposal"]) == ("adam_robust", "likelihood_grid")
+    assert any("pose of the laser is that of the odometry" in note for note in summary["notes"])
     counts = [summary[key] for key in ("particles", "segments", "runs", "updates")]
     assert counts == [60, 2, 4, 40] and summary["ms_per_update"] > 0
     assert all(0 <= summary[rate] <= 1 for rate in RATES)

@@ -96,12 +96,11 @@ def main() -> None:
     """Command line."""
     args = parse(Args, "python -m dsom_jax.localize")
     check(args)
-    folder = report.output_folder(args.out)
     summary = answer(args)
     if args.json:
         print(json.dumps(report.plain(summary), indent=2))
     else:
-        print_summary(summary, folder)
+        print_summary(summary, args.out)
 
 
 def answer(args: Args, carried: Sequence[float] = ()) -> dict[str, Any]:
@@ -124,7 +123,7 @@ def answer(args: Args, carried: Sequence[float] = ()) -> dict[str, Any]:
     with stage("expected ranges from every place of the map"):
         filter = jax.block_until_ready(build(args, grid, log.lidar, network))
     outcomes = localize(filter, each(drives, "segments"), args.runs, args.seed)
-    summary = summary_of(outcomes, grid, args, on_plan, others)
+    summary = summary_of(outcomes, grid, args, on_plan, others) | {"notes": notes}
     with stage("writing the page"):
         report.write_json(folder / "summary.json", summary)
         save_estimate(folder / "estimate.tum", outcomes)
