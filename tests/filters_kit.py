@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
@@ -16,14 +16,15 @@ from dsom_jax.filters.adam_robust import AdamRobust, RobustConfig
 from dsom_jax.filters.common import ParticleState
 from dsom_jax.filters.mcl import MCL
 from dsom_jax.filters.mixture import MixtureMCL
-from dsom_jax.filters.updates import FilterConfig, World
+from dsom_jax.filters.updates import FilterConfig
+from dsom_jax.filters.world import World
 from dsom_jax.motion import OdometryMotion
 from dsom_jax.nn import DSOMConfig, create, evaluation_view
 from dsom_jax.proposals.dsom import DSOMProposal, dsom
 from dsom_jax.proposals.likelihood_grid import LikelihoodGridConfig
 from dsom_jax.proposals.uniform import free_space
 from dsom_jax.raycast import RaycastConfig, make_tables
-from dsom_jax.sensor import BeamModel, ScoreModel
+from dsom_jax.sensor import BeamModel, RayTables, ScoreModel
 from dsom_jax.types import prepare_alone
 
 LIDAR = tiny_world.LIDAR
@@ -67,7 +68,7 @@ def grid():
 @pytest.fixture(scope="module")
 def world(grid):
     tables = make_tables(grid, RaycastConfig("table", angles=72), LIDAR.range_max)
-    return World(tables, free_space(grid), LIDAR, 1, OdometryMotion(), SCORE)
+    return World(grid, free_space(grid), RayTables(tables, LIDAR), 1, OdometryMotion(), SCORE)
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +89,7 @@ compiled_step = jax.jit(lambda f, key, state, inputs: f.step(key, state, inputs,
 
 def init(f, key):
     """The filter's own start; all Score-weighted filters share one, and one compilation."""
-    return compiled_init(MCL(f.world, f.config, injection=0.0) if hasattr(f, "world") else f, key)
+    return compiled_init(MCL(f.world, f.config, injection=0.0) if isinstance(f.config, FilterConfig) else f, key)
 
 
 def step(f, key, state, inputs):
@@ -115,8 +116,7 @@ def in_spot(spot, poses):
 
 
 def robust(world, proposal, particles=200, **fields):
-    config = RobustConfig(particles=particles, model=BEAM, **fields)
-    return AdamRobust(world.tables, world.space, proposal, LIDAR, 1, OdometryMotion(), config)
+    return AdamRobust(replace(world, sensor=BEAM), proposal, RobustConfig(particles=particles, **fields))
 
 
 def everyone(world, proposal, n):

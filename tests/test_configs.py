@@ -16,7 +16,7 @@ from dsom_jax.filters.methods import DRAWN, REAL, Settings
 from dsom_jax.filters.mixture import MixtureMCL
 from dsom_jax.filters.updates import FilterConfig
 from dsom_jax.lidar import LidarConfig, LidarNoise
-from dsom_jax.motion import AdditiveMapFrame, OdometryMotion, OmniMotion
+from dsom_jax.motion import OdometryMotion, OmniMotion
 from dsom_jax.nn import DSOMConfig, PFNetConfig, PFRNNConfig
 from dsom_jax.nn.local_view import ViewConfig
 from dsom_jax.proposals.dual_features import DualFeaturesConfig
@@ -60,7 +60,6 @@ WRONG: dict[type, tuple[dict, dict]] = {
         "tail_scale": (0.0,),
     }),
     OmniMotion: ({}, {"alpha1": (NAN,), "alpha5": (-0.1,), "min_xy": (-1.0,), "min_theta": (INF,)}),
-    AdditiveMapFrame: ({}, {"sigma_xy": (-0.1,), "sigma_theta": (NAN,)}),
     FilterConfig: ({}, {
         "particles": (0, -5, 1.5), "predecessor": ("nearest",), "resampling": ("none",), "weight_power": (0.0, NAN),
         "estimate_power": (0.0, NAN),
@@ -74,7 +73,7 @@ WRONG: dict[type, tuple[dict, dict]] = {
     }),
     Settings: ({}, {
         "particles": (0,), "max_beams": (0,), "seed": (-1,), "t_cut": (1.1,), "sharpness": (0.0, NAN),
-        "weight_power": (0.0, NAN), "robust_sharpness": (0.0, NAN),
+        "robust_sharpness": (0.0, NAN),
     }),
     LikelihoodGridConfig: ({}, {
         "resolution": (0.0, NAN), "headings": (0,), "angles_per_heading": (0,), "beams": (0,),

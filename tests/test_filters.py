@@ -18,10 +18,14 @@ from dsom_jax.episode import Episode
 from dsom_jax.filters.adam import AdamMCL
 from dsom_jax.filters.common import ParticleState, heaviest_cluster
 from dsom_jax.filters.mcl import MCL
+from dsom_jax.filters.methods import Settings, make_filter, with_motion, with_sensor
 from dsom_jax.filters.mixture import MixtureMCL
 from dsom_jax.filters.updates import FilterConfig
-from dsom_jax.motion import OdometryMotion
+from dsom_jax.geometry import wrap_angle
+from dsom_jax.montecarlo import run, run_keys
+from dsom_jax.motion import OdometryMotion, omni_like
 from dsom_jax.proposals.likelihood_grid import likelihood_grid
+from dsom_jax.proposals.uniform import free_space
 from filters_kit import (  # noqa: F401, fixtures
     GRID,
     LIDAR,
@@ -256,3 +260,20 @@ def test_heaviest_cluster_is_not_the_mean_of_two_places():
     centre, mass = jax.jit(heaviest_cluster)(poses, jnp.asarray(weights, jnp.float32))
     assert np.hypot(*(np.asarray(centre)[:2] - [1.0, 2.0])) < 0.05 and se2.angle_gap(float(centre[2]), np.pi) < 0.05
     assert float(mass) == pytest.approx(0.6, abs=1e-4)
+
+
+@pytest.mark.parametrize("name", ["beam", "likelihood_field", "score"])
+def test_adam_robust_finds_the_robot_with_any_sensor_model(grid, episode, scan_grid, name):
+    settings = with_sensor(Settings(particles=150, grid=GRID), name)
+    filter = make_filter("adam_robust", scan_grid, grid, LIDAR, settings)
+    assert filter.world.sensor.range_max == LIDAR.range_max
+    found = np.asarray(run(filter, episode, run_keys(0, 0, 4)).info.cluster)[:, -1]
+    off = found - np.asarray(episode.poses)[-1]
+    assert (np.hypot(off[:, 0], off[:, 1]) < 0.5).all() and (np.abs(wrap_angle(off[:, 2])) < np.radians(10)).all()
+
+
+def test_a_drive_that_moves_sideways_is_chosen_by_name(grid):
+    settings = with_motion(Settings(), "omni")
+    assert with_motion(Settings(), "differential") == Settings()
+    for name, own in (("mcl", Settings().motion), ("adam_robust", Settings().robust_motion)):
+        assert make_filter(name, free_space(grid), grid, LIDAR, settings).world.motion == omni_like(own)

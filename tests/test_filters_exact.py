@@ -46,7 +46,7 @@ def octants(grid, poses):
 def exact_masses(world, grid, episode):
     """Posterior of the octants after each scan, by the definition of the filter on 40,000 points that do not move."""
     points, _ = world.space.sample(jax.random.key(7), None, 40_000)
-    expected = jax.jit(cast_rays, static_argnums=2)(world.tables, points, LIDAR)
+    expected = jax.jit(cast_rays, static_argnums=2)(world.tables.map, points, LIDAR)
     uniform = np.full(len(points), 1 / len(points))
     belief, masses, where = None, [], octants(grid, points)
     for t in SCANS:
@@ -65,10 +65,8 @@ def uneven(grid):
 
 @pytest.mark.parametrize("flatten", [0.0, 0.5])
 def test_weights_of_robust_are_those_of_the_bayes_filter(world, grid, episode, flatten):
-    config = RobustConfig(
-        particles=20_000, kidnap=EPS, low_min=0.2, low_max=0.4, flatten=flatten, caution=0.0, model=BROAD
-    )
-    robust = AdamRobust(world.tables, world.space, uneven(grid), LIDAR, 1, STILL, config)
+    config = RobustConfig(particles=20_000, kidnap=EPS, low_min=0.2, low_max=0.4, flatten=flatten, caution=0.0)
+    robust = AdamRobust(replace(world, motion=STILL, sensor=BROAD), uneven(grid), config)
     state, variance = init(robust, jax.random.key(0)), 0.25 / 40_000
     for number, (t, exact) in enumerate(zip(SCANS, exact_masses(world, grid, episode), strict=True)):
         at_rest = at(episode, t)._replace(odometry=jnp.zeros(3))

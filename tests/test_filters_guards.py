@@ -49,7 +49,7 @@ def test_nobody_to_be_trusted(world, spot, episode, grid):
 
 def impossible(world):
     """A world whose weights vanish for every scan but the exact one."""
-    return replace(world, score=ScoreModel(sigma=0.005, beta=0.0, range_max=LIDAR.range_max))
+    return replace(world, sensor=ScoreModel(sigma=0.005, beta=0.0, range_max=LIDAR.range_max))
 
 
 def nonsense(episode):

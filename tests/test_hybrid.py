@@ -13,12 +13,14 @@ import pytest
 import tiny_world
 from dsom_jax import pose_grid as pg
 from dsom_jax.filters.methods import (
+    EXACT,
     LEARNED,
     METHODS,
     Settings,
     make_filter,
     make_proposal,
     powers_of,
+    sharp,
 )
 from dsom_jax.geometry import compose
 from dsom_jax.nn import create, evaluation_view
@@ -138,40 +140,35 @@ def test_a_network_is_sharpened_for_the_papers_filters_and_not_for_robust_ones(s
     assert proposal.sharpness == 2.5
 
 
-def test_powers_of_methods_are_those_of_their_filters():
+def test_powers_of_methods_follow_from_their_names():
     found = {name: powers_of(name) for name in METHODS}
-    assert {name for name, powers in found.items() if powers is None} == {
-        *LEARNED, *(name for name in METHODS if name.startswith("robust_"))
-    }  # fmt: skip
-    assert {name for name, powers in found.items() if powers == (1.0, 8.0)} == {
-        "adam_likelihood_grid", "adam_hybrid", "adam_markov_grid", "adam_markov_dsom", "adam_markov_hybrid"
-    }  # fmt: skip
-    assert found["adam_dsom"] == found["mcl"] == found["mixture_mcl_star"] == (8.0, 16.0)
-    assert powers_of("adam_dsom", 1.0) == (1.0, 1.0)
+    robust = {name for name in METHODS if name.startswith("robust_")}
+    assert {name for name, powers in found.items() if powers is None} == {*LEARNED, *robust}
+    printed = {name for name, powers in found.items() if powers == (1.0, 1.0)}
+    sharpened = {name for name, powers in found.items() if powers and powers != (1.0, 1.0)}
+    assert sharpened == {sharp(name) for name in printed} and not any("sharp" in name for name in printed)
+    assert {name for name in sharpened if found[name] == (1.0, 8.0)} == {f"adam_sharp_{source}" for source in EXACT}
+    assert found["adam_sharp_dsom"] == found["mcl_sharp"] == found["mixture_mcl_sharp_star"] == (8.0, 16.0)
+    assert powers_of("adam_sharp_dsom", 1.0) == (1.0, 1.0)
+    assert sharp("robust_dsom") == "robust_dsom" and sharp("pf_net") == "pf_net"
 
 
 @pytest.mark.parametrize(("factor", "expected"), [(1, (1, 360)), (4, (2, 180))])
 def test_maps_of_coarse_cells_have_more_viewpoints(factor, expected):
     grid = tiny_world.grid()
     grid = replace(grid, resolution=0.1 * factor)
-    tables = make_filter("mcl", free_space(grid), grid, LIDAR, Settings()).world.tables
+    tables = make_filter("mcl", free_space(grid), grid, LIDAR, Settings()).world.tables.map
     assert (tables.walls.shape[0] // grid.shape[0], tables.walls.shape[2]) == expected
 
 
-def test_power_one_is_as_printed():
-    for name in ("adam", "mixture_mcl", "mcl"):
-        source, settings = free_space(tiny_world.grid()), Settings(weight_power=1.0)
-        config = make_filter(name, source, tiny_world.grid(), LIDAR, settings).config
-        assert (config.weight_power, config.estimate_power) == (1.0, 1.0)
-
-
-@pytest.mark.parametrize("exact", [True, False])
-def test_alg_1_draws_as_printed_from_what_is_as_good_as_sure_only(parts, exact):
-    """All else draws by Eq 15 to the power, and averages by a higher one."""
-    settings = Settings(weight_power=8.0, grid=GRID)
+def test_what_a_filter_weighs_by_follows_from_its_name_and_not_from_its_proposal(parts):
     memories = MarkovGrid(parts[0]), MarkovNetwork(parts[0], network=parts[1])
-    for source in (parts[0], Hybrid(*parts, HybridConfig()), *memories) if exact else (parts[1],):
+    for source in (*parts, Hybrid(*parts, HybridConfig()), *memories):
         for name in ("adam", "mixture_mcl", "mcl"):
-            config = make_filter(name, source, tiny_world.grid(), LIDAR, settings).config
-            drawn, averaged = (1.0, 8.0) if exact and name == "adam" else (8.0, 16.0)
-            assert (config.weight_power, config.estimate_power) == (drawn, averaged)
+            for powers in ((8.0, 16.0), (1.0, 8.0)):
+                printed, sharpened = (
+                    make_filter(own, source, tiny_world.grid(), LIDAR, Settings(powers=powers, grid=GRID)).config
+                    for own in (name, f"{name}_sharp")
+                )
+                assert (printed.weight_power, printed.estimate_power) == (1.0, 1.0)
+                assert (sharpened.weight_power, sharpened.estimate_power) == powers

@@ -15,6 +15,7 @@ from dsom_jax.filters.adam import AdamMCL
 from dsom_jax.filters.adam_memory import AdamMemory
 from dsom_jax.filters.adam_robust import AdamRobust, RobustConfig, RobustState
 from dsom_jax.filters.methods import Settings, build_filter, make_filter
+from dsom_jax.filters.world import make_world
 from dsom_jax.geometry import compose, inverse, wrap_angle
 from dsom_jax.montecarlo import run, run_keys
 from dsom_jax.motion import OdometryMotion
@@ -24,7 +25,7 @@ from dsom_jax.pose_grid import cell_pose, pose_cell
 from dsom_jax.proposals.likelihood_grid import LikelihoodGridConfig, likelihood_grid
 from dsom_jax.proposals.markov_grid import MarkovGrid, MarkovGridConfig
 from dsom_jax.proposals.uniform import free_space
-from dsom_jax.raycast import RaycastConfig, make_tables
+from dsom_jax.raycast import RaycastConfig
 from dsom_jax.types import Inputs, prepare_alone
 from filters_kit import BEAM, GRID, LIDAR
 from reference import markov
@@ -149,9 +150,9 @@ def test_log_prior_is_the_density_of_the_belief_before_the_scan(memory):
 @pytest.fixture(scope="module")
 def filters(memory):
     grid = tiny_world.grid()
-    tables, space = make_tables(grid, RaycastConfig("table", angles=72), LIDAR.range_max), free_space(grid)
-    parts = (LIDAR, 1, OdometryMotion(), RobustConfig(particles=150, model=BEAM))
-    return AdamMemory(tables, space, memory, *parts), AdamRobust(tables, space, memory.likelihood, *parts)
+    world = make_world(grid, LIDAR, OdometryMotion(), BEAM, RaycastConfig("table", angles=72))
+    config = RobustConfig(particles=150)
+    return AdamMemory(world, memory, config), AdamRobust(world, memory.likelihood, config)
 
 
 def test_the_first_update_is_that_of_adam_robust(filters):
@@ -167,7 +168,7 @@ def test_shares_of_grid_and_particles(filters):
     blind = Inputs(jnp.full(LIDAR.beams, jnp.nan), jnp.zeros(3), jnp.int32(0))
     step = jax.jit(lambda f, key, state, prepared: f.step(key, state, blind, prepared)[0])
     prepared, belief = filters[0].prepare(filters[0].begin(), blind)
-    poses, _ = filters[0].space.sample(jax.random.key(1), None, 150)
+    poses, _ = filters[0].world.space.sample(jax.random.key(1), None, 150)
     state = RobustState(poses, jnp.full(150, -math.log(150)), jnp.float32(0.5), jnp.int32(2))
     masses = {}
     for share in (0.5, 0.1):

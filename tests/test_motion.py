@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from dsom_jax.motion import AdditiveMapFrame, OdometryMotion, OmniMotion
+from dsom_jax.motion import OdometryMotion, OmniMotion, omni_like
 from reference import se2
 
 QUIET = dict(alpha1=0.0, alpha2=0.0, alpha3=0.0, alpha4=0.0, min_xy=0.0, min_theta=0.0)
@@ -38,14 +38,6 @@ def test_without_noise_the_increment_is_composed(model, step):
     expected = se2.compose(poses, np.array(STEPS[step]))
     np.testing.assert_allclose(moved[:, :2], expected[:, :2], atol=1e-5)
     assert se2.angle_gap(moved[:, 2], expected[:, 2]).max() < 1e-5
-
-
-def test_additive_adds_in_the_map_frame_whatever_the_heading():
-    model = AdditiveMapFrame(0.0, 0.0)
-    poses = jnp.array([[1.0, 2.0, 0.0], [1.0, 2.0, 3.0]])
-    moved = np.asarray(model.sample(jax.random.key(0), poses, jnp.array([0.5, -0.25, 0.5])))
-    np.testing.assert_allclose(moved[:, :2], [[1.5, 1.75]] * 2, atol=1e-6)
-    assert se2.angle_gap(moved[:, 2], [0.5, 3.5]).max() < 1e-6 and moved[1, 2] < 0
 
 
 def errors(model, step, start=(3.0, -2.0, 2.5)):
@@ -110,7 +102,6 @@ def test_moments_of_the_omni_model():
 MODELS = {
     "odometry": OdometryMotion(**SMALL),
     "omni": OmniMotion(**SMALL, alpha5=0.004),
-    "additive": AdditiveMapFrame(0.03, 0.02),
 }
 
 
@@ -118,7 +109,7 @@ MODELS = {
 @pytest.mark.parametrize("step", ["arc", "backwards", "rest"])
 def test_density_integrates_to_one(name, step):
     pose, odometry = jnp.array([1.0, 2.0, 3.0]), jnp.array(STEPS[step])
-    mean = np.array(pose) + STEPS[step] if name == "additive" else se2.compose(np.array(pose), np.array(STEPS[step]))
+    mean = se2.compose(np.array(pose), np.array(STEPS[step]))
     drawn = np.asarray(sample(MODELS[name], jax.random.key(0), jnp.broadcast_to(pose, (N, 3)), odometry)) - mean
     drawn[:, 2] = np.angle(np.exp(1j * drawn[:, 2]))
     axes = [np.linspace(-6, 6, 41) * drawn[:, axis].std() for axis in range(3)]
@@ -174,3 +165,8 @@ def test_the_tail_is_wider_noise_for_some():
     )
     # A mixture's variance is the mean of the variances; a sample variance of such tails deviates by about 1 %.
     np.testing.assert_allclose(heavy.var(0) / plain.var(0), 0.75 + 0.25 * 16, rtol=0.06)
+
+
+def test_an_omnidirectional_drive_like_another_is_as_noisy():
+    own = OdometryMotion(0.01, 0.02, 0.03, 0.04, 0.05, 0.06, slip=0.1)
+    assert omni_like(own) == OmniMotion(0.01, 0.02, 0.03, 0.04, alpha5=0.03, min_xy=0.05, min_theta=0.06)

@@ -11,11 +11,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dsom_jax.lidar import LidarConfig
+import tiny_world
+from dsom_jax.lidar import LidarConfig, scan_points
 from dsom_jax.occupancy import from_cells
 from dsom_jax.sensor import (
     BeamModel,
     LikelihoodField,
+    RayTables,
     ScoreModel,
     beam_log_likelihood,
     beam_log_terms,
@@ -198,3 +200,50 @@ def test_an_invalid_scan_says_nothing():
     np.testing.assert_array_equal(
         field_log_likelihood(distance_field(grid, FIELD), grid, poses, nothing, FOUR, FIELD), 0.0
     )
+
+
+MODELS = {
+    "score": ScoreModel(sigma=0.5, temper=2.0, range_max=5.0),
+    "beam": BeamModel(**BEAM, sigma_hit=0.25, temper=0.5, range_max=5.0),
+    "likelihood_field": LikelihoodField(z_hit=0.8, z_rand=0.2, sigma_hit=0.5, temper=0.5, range_max=5.0),
+}
+
+
+def slowly(name, ranges, expected, ends):
+    """Log-likelihood of one scan by the slow references, untempered."""
+    if name == "score":
+        best = slow.score(ranges, ranges, 0.9, 0.1, 0.5, 5.0)
+        return math.log(slow.score(ranges, expected, 0.9, 0.1, 0.5, 5.0) / best)
+    if name == "beam":
+        return sum(slow.beam_log(o, p, **BEAM, sigma=0.25, top=5.0) for o, p in zip(ranges, expected, strict=True))
+    return slow.field_log(tiny_world.cells(), 0.25, ends, z_hit=0.8, z_rand=0.2, sigma=0.5, cut=2.0, top=5.0)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_models_behind_one_interface_against_the_slow_references(name):
+    episode, model = tiny_world.drive(), MODELS[name]
+    poses = episode.poses[:4]
+    ranges = episode.ranges[1].at[3].set(INF).at[7].set(NAN).at[11].add(0.4)
+    rays = RayTables(tiny_world.tables(), tiny_world.LIDAR)
+    found = model.log_likelihood(model.tables(rays), poses, ranges)
+    expected = np.asarray(tiny_world.cast(tiny_world.tables(), poses, tiny_world.LIDAR), float)
+    points, hit = (np.asarray(x) for x in scan_points(ranges, tiny_world.LIDAR))
+    for pose, row, value in zip(np.asarray(tiny_world.grid().to_grid(poses), float), expected, found, strict=True):
+        c, s = math.cos(pose[2]), math.sin(pose[2])
+        ends = [(pose[0] + c * x - s * y, pose[1] + s * x + c * y) for x, y in points[hit]]
+        by_hand = model.temper * slowly(name, [float(r) for r in ranges], [float(r) for r in row], ends)
+        # A term of a far beam is a product of numbers that float32 rounds; and rays may meet another cell's corner.
+        assert float(value) == pytest.approx(by_hand, rel=1e-3, abs=5e-3)
+    weights = np.asarray(model.weigh(model.tables(rays), poses, ranges))
+    if name == "score":  # in units of a scan without any difference
+        np.testing.assert_allclose(np.log(weights), found / 2.0, atol=1e-5)
+    else:  # in units of the best of these poses
+        np.testing.assert_allclose(weights, np.exp(found - np.max(found)), rtol=1e-5)
+    assert np.argmax(weights) == 1 and weights.max() <= 1.0
+
+
+def test_without_a_valid_beam_all_poses_weigh_the_same():
+    rays = RayTables(tiny_world.tables(), tiny_world.LIDAR)
+    for model in MODELS.values():
+        nothing = jnp.full(tiny_world.LIDAR.beams, NAN)
+        np.testing.assert_array_equal(model.weigh(model.tables(rays), tiny_world.drive().poses[:4], nothing), 1.0)

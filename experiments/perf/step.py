@@ -24,12 +24,11 @@ from dsom_jax.filters import updates
 from dsom_jax.filters.adam_robust import resampling_log_weights
 from dsom_jax.filters.common import describe
 from dsom_jax.filters.methods import build_filter
-from dsom_jax.raycast import cast_rays
 from dsom_jax.resampling import pick
 from dsom_jax.sensor import beam_log_likelihood, beam_score
 from dsom_jax.types import Inputs, prepare_alone
 
-METHODS = {"adam": "adam_likelihood_grid", "mcl": "mcl", "robust": "robust_likelihood_grid"}
+METHODS = {"adam": "adam_sharp_likelihood_grid", "mcl": "mcl_sharp", "robust": "robust_likelihood_grid"}
 Parts = dict[str, tuple[Callable[..., Any], tuple[Any, ...]]]
 """Name -> (function of one run, its arguments, of which the leading axis is the run)."""
 
@@ -43,7 +42,7 @@ def main(runs: int = 100, particles: int = 200, repeats: int = 15, warm: int = 8
         if only and name not in only:
             continue
         filter = build_filter(method, grid, suite.lidar, particles=particles, t_cut=0.6)
-        measured[name] = method_times(filter, episode, runs, repeats, warm)
+        measured[name] = method_times(name, filter, episode, runs, repeats, warm)
         print(
             f"{name}: " + ", ".join(f"{k} {v['wall_ms']:.1f} ({v['cpu_ms']:.1f})" for k, v in measured[name].items()),
             flush=True,
@@ -53,7 +52,9 @@ def main(runs: int = 100, particles: int = 200, repeats: int = 15, warm: int = 8
     save("step", {"machine": machine(), "load": load, "methods": measured})
 
 
-def method_times(filter: Any, episode: Episode, runs: int, repeats: int, warm: int) -> dict[str, dict[str, float]]:
+def method_times(
+    name: str, filter: Any, episode: Episode, runs: int, repeats: int, warm: int
+) -> dict[str, dict[str, float]]:
     """Times of the whole step, of ``prepare``, and of the parts of the step."""
     keys = montecarlo.run_keys(0, 0, runs)
     first = jax.tree.map(lambda leaf: leaf[:warm], episode)
@@ -64,7 +65,7 @@ def method_times(filter: Any, episode: Episode, runs: int, repeats: int, warm: i
     times = {"step": measure(lambda: step(filter, keys, states, now, prepared), repeats)}
     if prepared is not None:
         times["prepare"] = measure(lambda: prepare(filter, now), repeats)
-    split = robust_parts if hasattr(filter, "tables") else score_parts
+    split = robust_parts if name.startswith("robust") else score_parts
     for name, (function, arguments) in split(filter, keys, states, now, prepared).items():
         part = compiled(jax.vmap(function))
         times[name] = measure(partial(part, *arguments), repeats)
@@ -86,14 +87,14 @@ def score_parts(filter: Any, keys: Any, states: Any, now: Inputs, prepared: Any)
     """Parts of the paper's filters."""
     world, config = filter.world, filter.config
     member = jnp.ones(states.weights.shape, bool)
-    expected = compiled(lambda poses: cast_rays(world.tables, poses, world.lidar))(states.poses)
+    expected = compiled(world.tables.expected)(states.poses)
     seen = now.ranges[:: world.beam_step]
     parts: Parts = {
         "resample": (lambda k, s, m: updates.masked_ancestors(k, s.normalised, m, config.resampling),
                      (keys, states, member)),
         "move": (lambda k, s: world.motion.sample(k, s.poses, now.odometry), (keys, states)),
-        "rays": (lambda s: cast_rays(world.tables, s.poses, world.lidar), (states,)),
-        "score": (lambda e: beam_score(seen, e, world.score), (expected,)),
+        "rays": (lambda s: world.tables.expected(s.poses), (states,)),
+        "score": (lambda e: beam_score(seen, e, world.sensor), (expected,)),
         "rays_and_score": (lambda s: world.weigh(s.poses, now.ranges), (states,)),
         "estimates": (lambda s: describe(s.poses, s.normalised, jnp.float32(0.0), jnp.bool_(False)), (states,)),
     }  # fmt: skip
@@ -106,9 +107,9 @@ def score_parts(filter: Any, keys: Any, states: Any, now: Inputs, prepared: Any)
 
 def robust_parts(filter: Any, keys: Any, states: Any, now: Inputs, prepared: Any) -> Parts:
     """Parts of AdaM robust."""
-    count = filter.config.particles
-    expected = compiled(lambda poses: cast_rays(filter.tables, poses, filter.lidar))(states.poses)
-    seen = now.ranges[:: filter.beam_step]
+    world, count = filter.world, filter.config.particles
+    expected = compiled(world.tables.expected)(states.poses)
+    seen = now.ranges[:: world.beam_step]
 
     def resample(key: Any, state: Any) -> Any:
         log_r = resampling_log_weights(state.log_weights, filter.config.flatten)
@@ -116,10 +117,10 @@ def robust_parts(filter: Any, keys: Any, states: Any, now: Inputs, prepared: Any
 
     return {
         "resample": (resample, (keys, states)),
-        "move": (lambda k, s: filter.motion.sample(k, s.poses, now.odometry), (keys, states)),
+        "move": (lambda k, s: world.motion.sample(k, s.poses, now.odometry), (keys, states)),
         "draw_once": (lambda k: filter.proposal.sample(k, prepared, count), (keys,)),
-        "rays": (lambda s: cast_rays(filter.tables, s.poses, filter.lidar), (states,)),
-        "likelihood": (lambda e: beam_log_likelihood(seen, e, filter.config.model), (expected,)),
+        "rays": (lambda s: world.tables.expected(s.poses), (states,)),
+        "likelihood": (lambda e: beam_log_likelihood(seen, e, world.sensor), (expected,)),
         "estimates": (
             lambda s: describe(s.poses, jnp.exp(s.log_weights), jnp.float32(0.0), jnp.bool_(False)),
             (states,),

@@ -29,7 +29,7 @@ from dsom_jax.compiling import run_options
 from dsom_jax.data.suite import Suite, load_suite
 from dsom_jax.episode import Episode
 from dsom_jax.errors import UserError
-from dsom_jax.filters.methods import WEIGHT_POWER, build_filter, network_of, powers_of
+from dsom_jax.filters.methods import WEIGHT_POWER, build_filter, network_of, powers_of, sharp
 from dsom_jax.judging.run_table import RunTable, stored
 from dsom_jax.montecarlo import run_keys
 from dsom_jax.occupancy import OccupancyGrid
@@ -47,7 +47,7 @@ PROPOSALS = {
 }
 """Proposals that are compared: what figures call them, and their colours."""
 NETWORKS = ("dsom", "pf_net", "pfrnn")
-POWERS = powers_of("adam_dsom")
+POWERS = powers_of("adam_sharp_dsom")
 """Powers of Eq 15 by which filters draw and average; part of what results depend on."""
 Results = Mapping[str, dict[str, Any]]
 """What the jobs of one piece gave, by job."""
@@ -116,14 +116,17 @@ class Lab:
         t_cut: float = 0.6,
         weight_power: float = WEIGHT_POWER,
     ) -> Filter:
-        """Filter of a method of :data:`dsom_jax.filters.methods.METHODS` on the map called ``where``."""
+        """Filter of a method of :data:`dsom_jax.filters.methods.METHODS` on the map called ``where``.
+
+        Whatever weighs by Eq 15 is taken sharpened (``_sharp``), by ``weight_power``; results name it without that.
+        """
         network = self.networks.get(network_of(name) or "")
         made = self.sources.setdefault(where, {})
         own: dict[str, Any] = {
             "particles": particles, "t_cut": t_cut, "weight_power": weight_power, "episode": episode,
         }  # fmt: skip
         return jax.block_until_ready(
-            build_filter(name, grid, self.suite.lidar, **own, checkpoint=network, sources=made)
+            build_filter(sharp(name), grid, self.suite.lidar, **own, checkpoint=network, sources=made)
         )
 
     def by_sequence(self, work: Callable[..., T]) -> list[T]:

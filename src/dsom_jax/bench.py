@@ -28,7 +28,7 @@ from dsom_jax.types import Filter, Key, Proposal
 
 ESTIMATES = ("mean", "cluster")
 """The weighted mean of the paper, and the mean of the heaviest cluster."""
-PER_EPISODE = ("mixture_mcl_star",)
+PER_EPISODE = ("mixture_mcl_star", "mixture_mcl_sharp_star")
 """Methods whose filter knows the episode, not only the map."""
 
 
@@ -41,9 +41,8 @@ class Args:
     suite: str = "synthetic-v1"
     """Name of a suite, or a TOML file that describes one."""
     methods: str = ""
-    """Comma-separated method names; default: the eight of the standard comparison (not the hybrids, grids with
-    a memory, PF-Net and PFRNN),
-    without those that need a network where none is shipped."""
+    """Comma-separated method names; default: the ten of the standard comparison, without those that need a network
+    where none is shipped."""
     particles: int = 200
     """Particles per run."""
     t_cut: float = 0.6
@@ -51,7 +50,7 @@ class Args:
     seed: int = 0
     """Seed of all randomness; method, sequence and run number do the rest."""
     weight_power: float = WEIGHT_POWER
-    """Power of Eq 15 by which particles are drawn, and averaged (:func:`filters.methods.powers`); 1 as printed."""
+    """Power of Eq 15 in the `_sharp` methods; the others weigh as the paper prints, by Eq 15 itself."""
     out: Path | None = None
     """Folder for bench.json, bench.md and figures."""
     checkpoint: Path | None = None

@@ -24,7 +24,16 @@ from dsom_jax.data import LogOptions, RawLog, Report, load_log, load_map
 from dsom_jax.data.cut import segment_indices, splice, to_episode, without_repeats
 from dsom_jax.data.log import STILL, limited
 from dsom_jax.errors import UserError, run_cli
-from dsom_jax.filters.methods import DRAWN, REAL, make_filter, make_proposal, watch
+from dsom_jax.filters.methods import (
+    DRAWN,
+    REAL,
+    make_filter,
+    make_proposal,
+    sharp_powers,
+    watch,
+    with_motion,
+    with_sensor,
+)
 from dsom_jax.judging import metrics
 from dsom_jax.judging.foreign import named, replies_of
 from dsom_jax.judging.rooms import rooms_of
@@ -53,8 +62,10 @@ class Args:
     """TUM trajectory of the base in the map frame; default: the log's own, where it has one."""
     reading: Annotated[LogOptions, tyro.conf.arg(name="")] = LogOptions()
     """What the log does not say, or says wrongly; topics and frames are those of bags."""
-    method: Literal["adam_robust", "adam", "mcl", "mixture_mcl"] = "adam_robust"
-    """Particle filter."""
+    method: Literal["adam_robust", "adam", "adam_sharp", "mcl", "mcl_sharp", "mixture_mcl", "mixture_mcl_sharp"] = (
+        "adam_robust"
+    )
+    """Particle filter; `adam`, `mcl`, `mixture_mcl` weigh as the paper prints, `_sharp` by powers of Eq 15."""
     proposal: Literal["likelihood_grid", "dsom", "hybrid", "uniform", "dual_features"] = "likelihood_grid"
     """Where redrawn particles come from; `mcl` always draws uniformly."""
     checkpoint: Path | None = None
@@ -73,6 +84,10 @@ class Args:
     """Metres driven between updates."""
     update_min_a: float = 0.2
     """Radians turned between updates."""
+    sensor_model: Literal["beam", "likelihood_field", "score"] | None = None
+    """What a scan says of a pose; default: `beam` for adam_robust, `score`, Eq 15 of the paper, for the others."""
+    motion_model: Literal["differential", "omni"] = "differential"
+    """Drive of the robot: `omni` also moves sideways (nav2's robot_model_type)."""
     memory: bool = True
     """Let adam_robust remember earlier scans on the likelihood grid; --no-memory judges every scan on its own."""
     kidnap: bool = False
@@ -164,7 +179,7 @@ def check_network(args: Args) -> None:
     if needs_network(args) and network_folder(args) is None:
         raise UserError(f"--proposal {args.proposal}: give --checkpoint, the folder of a trained network")
     if args.checkpoint and not needs_network(args):
-        chosen = "--method mcl" if args.method == "mcl" else f"--proposal {args.proposal}"
+        chosen = f"--method {args.method}" if args.method.startswith("mcl") else f"--proposal {args.proposal}"
         fix = "leave it out, or give --proposal dsom or hybrid and a --method other than mcl"
         raise UserError(f"--checkpoint {args.checkpoint}: has no use with {chosen}; {fix}")
 
@@ -202,7 +217,7 @@ def distinct(log: RawLog, rows: np.ndarray, args: Args) -> np.ndarray:
 
 def drawn_from(args: Args) -> str:
     """Name of the proposal that the filter draws from, whatever the arguments name: MCL's is uniform."""
-    return "uniform" if args.method == "mcl" else args.proposal
+    return "uniform" if args.method.startswith("mcl") else args.proposal
 
 
 def remembers(args: Args) -> bool:
@@ -230,7 +245,10 @@ def build(args: Args, grid: OccupancyGrid, lidar: LidarConfig, network: Any = No
     """The filter that the arguments ask for, with a verdict on its answers."""
     kind = DRAWN if args.map_kind == "drawn" else REAL
     own = ("particles", "t_cut", "max_beams", "seed", "memory")
-    settings = replace(kind, **{name: getattr(args, name) for name in own})
+    settings = replace(kind, **{name: getattr(args, name) for name in own}, powers=sharp_powers(drawn_from(args)))
+    if args.sensor_model:
+        settings = with_sensor(settings, args.sensor_model)
+    settings = with_motion(settings, args.motion_model)
     proposal = make_proposal(drawn_from(args), grid, lidar, settings, network)
     filter = make_filter(args.method, proposal, grid, lidar, settings)
     return watch(filter, grid, lidar, settings, judged_by(args.method))

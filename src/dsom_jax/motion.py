@@ -157,30 +157,7 @@ class OmniMotion:
         return norm.logpdf(error, 0.0, self.spread(odometry)).sum(-1)
 
 
-@dataclass(frozen=True)
-class AdditiveMapFrame:
-    """Eq 14, the authors' own: s' = s + a + N(0, sigma), where ``a`` is an increment in the *map* frame.
-
-    Such increments tell the filter the heading; it is kept for parity runs only, on episodes made for it.
-
-    Attributes:
-        sigma_xy, sigma_theta: standard deviations, metres and radians.
-    """
-
-    sigma_xy: float = 0.1
-    sigma_theta: float = 0.05
-
-    def __post_init__(self) -> None:
-        checks.not_negative(self, "sigma_xy sigma_theta")
-
-    def sample(self, key: Key, poses: Array, odometry: Array) -> Array:
-        """One successor of each pose (..., 3)."""
-        sigma = jnp.array([self.sigma_xy, self.sigma_xy, self.sigma_theta])
-        moved = poses + odometry + sigma * jax.random.normal(key, poses.shape)
-        return moved.at[..., 2].set(wrap_angle(moved[..., 2]))
-
-    def log_prob(self, new_poses: Array, poses: Array, odometry: Array) -> Array:
-        """Log density (...) in 1 / (m^2 rad)."""
-        error = new_poses - poses - odometry
-        error = error.at[..., 2].set(wrap_angle(error[..., 2]))
-        return norm.logpdf(error, 0.0, jnp.array([self.sigma_xy, self.sigma_xy, self.sigma_theta])).sum(-1)
+def omni_like(drive: OdometryMotion) -> OmniMotion:
+    """An omnidirectional drive with the noise of a differential one, as wide sideways as along."""
+    shared = {name: getattr(drive, name) for name in ("alpha1", "alpha2", "alpha3", "alpha4", "min_xy", "min_theta")}
+    return OmniMotion(**shared, alpha5=drive.alpha3)

@@ -1,24 +1,66 @@
-"""Observation models: the paper's Score (Eq 15), and true log-likelihoods of a scan.
+"""Observation models p(z | x): the paper's Score (Eq 15), the beam model, and the likelihood field.
 
-Ranges follow REP-117 throughout: +inf is a beam without return and is evidence, NaN and -inf are invalid and are not.
+A filter takes any :class:`SensorModel`. Ranges follow REP-117 throughout: +inf is a beam without return and is
+evidence, NaN and -inf are invalid and are not.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 
 from dsom_jax import checks
 from dsom_jax.geometry import transform_points
 from dsom_jax.lidar import LidarConfig, scan_points
 from dsom_jax.occupancy import OccupancyGrid, euclidean_distance
+from dsom_jax.raycast import MapTables, cast_rays
 from dsom_jax.types import Array
 
 
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class ScoreModel:
+class RayTables:
+    """A map, and the beams of a lidar that a filter uses.
+
+    Attributes:
+        map: what ray casting precomputed of the map; ``map.grid`` is the map itself.
+        lidar: geometry of the beams that are used (static).
+    """
+
+    map: MapTables
+    lidar: LidarConfig = field(metadata={"static": True})
+
+    def expected(self, poses: Array) -> Array:
+        """Ranges (..., B) in metres that base poses (..., 3) lead one to expect; +inf for no return."""
+        return cast_rays(self.map, poses, self.lidar)
+
+
+class SensorModel(ABC):
+    """What a scan says of a pose. A subclass is a frozen dataclass with :meth:`log_likelihood`; the rest is given."""
+
+    def tables(self, rays: RayTables) -> Any:
+        """What :meth:`log_likelihood` needs of map and lidar, a pytree made once per map; here the map for rays."""
+        return rays
+
+    @abstractmethod
+    def log_likelihood(self, tables: Any, poses: Array, ranges: Array) -> Array:
+        """log p(z | x) (...) of one scan (B,) at base poses (..., 3), up to a constant of the scan."""
+
+    def weigh(self, tables: Any, poses: Array, ranges: Array) -> Array:
+        """Weights (N,) for Alg 1 and MCL, in units of the best possible one; here, of the best among ``poses``."""
+        evidence = self.log_likelihood(tables, poses, ranges)
+        best = evidence.max()
+        return jnp.where(jnp.isfinite(best), jnp.exp(evidence - jnp.where(jnp.isfinite(best), best, 0.0)), 0.0)
+
+
+@dataclass(frozen=True)
+class ScoreModel(SensorModel):
     """Eq 15 of the paper.
 
     Attributes:
@@ -26,6 +68,7 @@ class ScoreModel:
         alpha, beta: weights of the Gaussian and of the constant 1 / range_max.
         range_max: L_max, metres.
         power: exponent of each beam's term; 3 in the paper, 1 in the authors' code.
+        temper: factor on log Score where it stands for a log-likelihood, in AdaM robust.
     """
 
     sigma: float = 5 / 3
@@ -33,11 +76,22 @@ class ScoreModel:
     beta: float = 0.1
     range_max: float = 10.0
     power: int = 3
+    temper: float = 1.0
 
     def __post_init__(self) -> None:
-        checks.positive(self, "sigma range_max")
+        checks.positive(self, "sigma range_max temper")
         checks.not_negative(self, "alpha beta")
         checks.count(self, "power")
+
+    def log_likelihood(self, tables: RayTables, poses: Array, ranges: Array) -> Array:
+        """Tempered log(w / w*)."""
+        return self.temper * jnp.log(self.weigh(tables, poses, ranges))
+
+    def weigh(self, tables: RayTables, poses: Array, ranges: Array) -> Array:
+        """w / w* by Eq 15, the trust T of Alg 1; one if no beam of the scan is valid."""
+        best = perfect_score(ranges, self)
+        score = beam_score(ranges, tables.expected(poses), self)
+        return jnp.where(best > 0, score / jnp.where(best > 0, best, 1.0), 1.0)
 
 
 def valid_beams(ranges: Array) -> Array:
@@ -66,7 +120,7 @@ def perfect_score(ranges: Array, model: ScoreModel) -> Array:
 
 
 @dataclass(frozen=True)
-class BeamModel:
+class BeamModel(SensorModel):
     """Tempered beam model (Probabilistic Robotics, table 6.1), per metre of range.
 
     Attributes:
@@ -89,6 +143,10 @@ class BeamModel:
         checks.sum_to_one(self, "z_hit z_short z_max z_rand")
         checks.positive(self, "sigma_hit temper range_max")
 
+    def log_likelihood(self, tables: RayTables, poses: Array, ranges: Array) -> Array:
+        """Tempered log p(z | x) against the walls that the rays meet."""
+        return beam_log_likelihood(ranges, tables.expected(poses), self)
+
 
 def beam_log_terms(ranges: Array, expected: Array, model: BeamModel) -> Array:
     """Log-likelihood of each beam, shapes broadcast, untempered; 0 for invalid beams."""
@@ -107,8 +165,24 @@ def beam_log_likelihood(ranges: Array, expected: Array, model: BeamModel) -> Arr
     return model.temper * beam_log_terms(ranges, expected, model).sum(-1)
 
 
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class LikelihoodField:
+class FieldTables:
+    """A map for end points.
+
+    Attributes:
+        distance: (H, W) metres from cell centres to the nearest occupied one, cut at ``max_distance``.
+        grid: the map.
+        lidar: geometry of the beams that are used (static).
+    """
+
+    distance: Array
+    grid: OccupancyGrid
+    lidar: LidarConfig = field(metadata={"static": True})
+
+
+@dataclass(frozen=True)
+class LikelihoodField(SensorModel):
     """Tempered end-point model (Probabilistic Robotics, table 6.3; nav2 ``likelihood_field``).
 
     Attributes:
@@ -131,31 +205,41 @@ class LikelihoodField:
         checks.sum_to_one(self, "z_hit z_rand")
         checks.positive(self, "sigma_hit max_distance temper range_max")
 
+    def tables(self, rays: RayTables) -> FieldTables:
+        """The distance field in place of rays."""
+        grid = rays.map.grid
+        return FieldTables(distance_field(grid, self), grid, rays.lidar)
 
+    def log_likelihood(self, tables: FieldTables, poses: Array, ranges: Array) -> Array:
+        """Tempered log p(z | x) of the scan's end points."""
+        return field_log_likelihood(tables.distance, tables.grid, poses, ranges, tables.lidar, self)
+
+
+@partial(jax.jit, static_argnames="model")
 def distance_field(grid: OccupancyGrid, model: LikelihoodField) -> Array:
     """(H, W) metres from cell centres to the nearest occupied one, at most ``max_distance``."""
     cap = max(1, math.ceil(model.max_distance / grid.resolution))
     return jnp.minimum(euclidean_distance(grid.occupied, cap) * grid.resolution, model.max_distance)
 
 
-def interpolate(field: Array, i: Array, j: Array) -> Array:
-    """Bilinear value of ``field`` (H, W) at real-valued cell coordinates, edges extended."""
-    i, j = jnp.clip(i, 0, field.shape[0] - 1), jnp.clip(j, 0, field.shape[1] - 1)
+def interpolate(values: Array, i: Array, j: Array) -> Array:
+    """Bilinear value of ``values`` (H, W) at real-valued cell coordinates, edges extended."""
+    i, j = jnp.clip(i, 0, values.shape[0] - 1), jnp.clip(j, 0, values.shape[1] - 1)
     i0, j0 = (jnp.floor(v).astype(jnp.int32) for v in (i, j))
-    i1, j1 = jnp.minimum(i0 + 1, field.shape[0] - 1), jnp.minimum(j0 + 1, field.shape[1] - 1)
+    i1, j1 = jnp.minimum(i0 + 1, values.shape[0] - 1), jnp.minimum(j0 + 1, values.shape[1] - 1)
     di, dj = i - i0, j - j0
-    low = field[i0, j0] * (1 - dj) + field[i0, j1] * dj
-    high = field[i1, j0] * (1 - dj) + field[i1, j1] * dj
+    low = values[i0, j0] * (1 - dj) + values[i0, j1] * dj
+    high = values[i1, j0] * (1 - dj) + values[i1, j1] * dj
     return low * (1 - di) + high * di
 
 
 def field_log_likelihood(
-    field: Array, grid: OccupancyGrid, poses: Array, ranges: Array, lidar: LidarConfig, model: LikelihoodField
+    distance: Array, grid: OccupancyGrid, poses: Array, ranges: Array, lidar: LidarConfig, model: LikelihoodField
 ) -> Array:
     """Tempered log p(z | x) (...) of one scan (B,) at poses (..., 3); beams without return say nothing here."""
     points, valid = scan_points(ranges, lidar)
     ends = transform_points(grid.to_grid(poses), points) / grid.resolution - 0.5
-    distance = interpolate(field, ends[..., 1], ends[..., 0])
-    density = jnp.exp(-0.5 * (distance / model.sigma_hit) ** 2) / (model.sigma_hit * math.sqrt(2 * math.pi))
+    gap = interpolate(distance, ends[..., 1], ends[..., 0])
+    density = jnp.exp(-0.5 * (gap / model.sigma_hit) ** 2) / (model.sigma_hit * math.sqrt(2 * math.pi))
     terms = jnp.log(model.z_hit * density + model.z_rand / model.range_max)
     return model.temper * jnp.where(valid, terms, 0.0).sum(-1)

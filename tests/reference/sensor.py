@@ -55,12 +55,20 @@ def field_log(
     cut: float,
     top: float,
 ) -> float:
-    """Sum of log-likelihoods of end points that lie exactly on cell centres (x, y), grid frame, metres."""
+    """Sum of log-likelihoods of end points (x, y), grid frame, metres: distances of cell centres, bilinear between."""
     total = 0.0
     for x, y in ends:
-        nearest = cut
-        for i, j in zip(*np.nonzero(occupied), strict=True):
-            gap = math.hypot((j + 0.5) * resolution - x, (i + 0.5) * resolution - y)
-            nearest = min(nearest, gap)
+        nearest = between(occupied, x / resolution - 0.5, y / resolution - 0.5, cut / resolution) * resolution
         total += math.log(z_hit * gauss(nearest, sigma) + z_rand / top)
+    return total
+
+
+def between(occupied: np.ndarray, j: float, i: float, cut: float) -> float:
+    """Cells to the nearest occupied one, interpolated between the four centres around (i, j); edges extended."""
+    i, j = min(max(i, 0.0), occupied.shape[0] - 1), min(max(j, 0.0), occupied.shape[1] - 1)
+    total = 0.0
+    for row, down in ((math.floor(i), 1 - i % 1), (math.floor(i) + 1, i % 1)):
+        for column, along in ((math.floor(j), 1 - j % 1), (math.floor(j) + 1, j % 1)):
+            walls = zip(*np.nonzero(occupied), strict=True)
+            total += down * along * min(cut, min(math.hypot(r - row, c - column) for r, c in walls))
     return total

@@ -57,7 +57,7 @@ class AdamMemory(AdamRobust):
         """log(a b-(x)); at the first update all is redrawn."""
         share = jnp.where(state.updates == 0, 0.0, jnp.log(self._share(state)))
         # The grid knows where the sensor may be; beside it the base may stand in a wall.
-        stands = is_free(self.tables.grid, poses)
+        stands = is_free(self.world.grid, poses)
         return share + jnp.where(stands, self.proposal.log_prior(prepared, poses), -jnp.inf)
 
 
@@ -76,7 +76,7 @@ class AdamPlaces(AdamMemory):
         """L: from the pool of the belief, which knows what it believed of each before the scan."""
         poses, log_prior, log_q = self.proposal.draw(key, prepared, self.config.particles)
         share = jnp.where(state.updates == 0, 0.0, jnp.log(self._share(state)))
-        stands = is_free(self.tables.grid, poses)
+        stands = is_free(self.world.grid, poses)
         return Draw(poses, share + jnp.where(stands, log_prior - log_q, -jnp.inf) - jnp.log(low.sum()))
 
     def _worth(self, state: RobustState, prepared: Places) -> Array:  # type: ignore[override]

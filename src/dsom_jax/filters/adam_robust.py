@@ -21,13 +21,10 @@ from jax.scipy.special import logsumexp
 
 from dsom_jax import checks
 from dsom_jax.filters.common import Info, describe
-from dsom_jax.lidar import LidarConfig
+from dsom_jax.filters.world import World
 from dsom_jax.occupancy import is_free
-from dsom_jax.proposals.uniform import FreeSpace
-from dsom_jax.raycast import MapTables, cast_rays
 from dsom_jax.resampling import pick
-from dsom_jax.sensor import BeamModel, beam_log_likelihood
-from dsom_jax.types import Array, Inputs, Key, Motion, Proposal
+from dsom_jax.types import Array, Inputs, Key, Proposal
 
 
 @dataclass(frozen=True)
@@ -43,7 +40,6 @@ class RobustConfig:
             places live on, at their true weight, until several scans have spoken.
         caution: share of the log-likelihood that is left out while the filter is wholly lost: one scan alone, of a
             place that looks like others, is not to decide.
-        model: log-likelihood of a scan.
     """
 
     particles: int = 500
@@ -52,7 +48,6 @@ class RobustConfig:
     low_max: float = 0.5
     flatten: float = 0.3
     caution: float = 0.5
-    model: BeamModel = BeamModel()
 
     def __post_init__(self) -> None:
         checks.count(self, "particles")
@@ -91,20 +86,13 @@ class AdamRobust:
     """Adaptive mixture particle filter with a kidnapping prior.
 
     Attributes:
-        tables: the map.
-        space: uniform distribution over its free poses, u.
+        world: map and models; ``world.space`` is u.
         proposal: samplable observation model, q; wherever it has mass zero, the filter cannot find the robot anew.
-        lidar: beams that are used (static); every ``beam_step``-th of the scan (static).
-        motion: model of the drive (static).
         config: static.
     """
 
-    tables: MapTables
-    space: FreeSpace
+    world: World
     proposal: Proposal
-    lidar: LidarConfig = field(metadata={"static": True})
-    beam_step: int = field(metadata={"static": True})
-    motion: Motion = field(metadata={"static": True})
     config: RobustConfig = field(metadata={"static": True})
 
     def begin(self) -> Any:
@@ -118,7 +106,7 @@ class AdamRobust:
     def init(self, key: Key) -> RobustState:
         """Uniform particles; the first update replaces them all."""
         n = self.config.particles
-        poses, _ = self.space.sample(key, None, n)
+        poses, _ = self.world.space.sample(key, None, n)
         return RobustState(poses, jnp.full((n,), -math.log(n), jnp.float32), jnp.float32(1.0), jnp.int32(0))
 
     def step(self, key: Key, state: RobustState, inputs: Inputs, prepared: Any) -> tuple[RobustState, Info]:
@@ -151,7 +139,7 @@ class AdamRobust:
         count = jnp.maximum((~low).sum(), 1)
         rank = jnp.maximum(jnp.cumsum(~low) - 1, 0)
         ancestors = pick(jnp.cumsum(jnp.exp(log_r)), (rank + jax.random.uniform(k_resample)) / count)
-        poses = self.motion.sample(k_move, state.poses[ancestors], inputs.odometry)
+        poses = self.world.motion.sample(k_move, state.poses[ancestors], inputs.odometry)
         return Draw(poses, self._log_kept(state) + (state.log_weights - log_r)[ancestors] - jnp.log(count))
 
     def _redraw(self, key: Key, state: RobustState, low: Array, prepared: Any) -> Draw:
@@ -167,7 +155,7 @@ class AdamRobust:
         """Prior that L stands for, log(eps u(x)) (N,); at the first update it is all of it."""
         prior = jnp.where(state.updates == 0, 0.0, jnp.log(self.config.kidnap))
         # u is zero where no robot can stand, whatever q thinks: cells of PM may be larger than those of the map.
-        return prior + jnp.where(is_free(self.tables.grid, poses), self.space.log_density_value, -jnp.inf)
+        return prior + jnp.where(is_free(self.world.grid, poses), self.world.space.log_density_value, -jnp.inf)
 
     def _worth(self, state: RobustState, prepared: Any) -> Array:
         """Share of the evidence that counts (): less while the filter is lost."""
@@ -175,8 +163,7 @@ class AdamRobust:
 
     def _evidence(self, poses: Array, inputs: Inputs) -> Array:
         """log p(z | x) (N,)."""
-        seen = inputs.ranges[:: self.beam_step]
-        return beam_log_likelihood(seen, cast_rays(self.tables, poses, self.lidar), self.config.model)
+        return self.world.log_likelihood(poses, inputs.ranges)
 
     def _doubted(self, info: Info, prepared: Any) -> Info:
         """What else is known of the answer."""

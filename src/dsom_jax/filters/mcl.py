@@ -10,7 +10,8 @@ import numpy as np
 
 from dsom_jax import checks
 from dsom_jax.filters.common import Info, ParticleState
-from dsom_jax.filters.updates import Draw, FilterConfig, World, conclude, resample_and_move, start
+from dsom_jax.filters.updates import Draw, FilterConfig, conclude, resample_and_move, start
+from dsom_jax.filters.world import World
 from dsom_jax.types import Array, Inputs, Key
 
 

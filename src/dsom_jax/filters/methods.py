@@ -21,9 +21,10 @@ from dsom_jax.filters.mcl import MCL
 from dsom_jax.filters.mixture import MixtureMCL
 from dsom_jax.filters.pf_net import pf_net
 from dsom_jax.filters.pfrnn import pfrnn
-from dsom_jax.filters.updates import FilterConfig, World
+from dsom_jax.filters.updates import FilterConfig
+from dsom_jax.filters.world import make_world
 from dsom_jax.lidar import LidarConfig
-from dsom_jax.motion import OdometryMotion
+from dsom_jax.motion import OdometryMotion, omni_like
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.proposals.dsom import DSOMProposal, dsom
 from dsom_jax.proposals.dual_features import DualFeaturesConfig, dual_features, with_episode
@@ -33,12 +34,13 @@ from dsom_jax.proposals.markov_grid import MarkovGrid, MarkovGridConfig
 from dsom_jax.proposals.markov_network import MarkovNetwork, MarkovNetworkConfig
 from dsom_jax.proposals.uniform import free_space
 from dsom_jax.raycast import RaycastConfig, make_tables
-from dsom_jax.sensor import BeamModel, ScoreModel
+from dsom_jax.sensor import BeamModel, LikelihoodField, ScoreModel, SensorModel
 from dsom_jax.types import Filter, Motion, Proposal
 
-Algorithm = Literal["mcl", "mixture_mcl", "adam", "adam_robust"]
+Algorithm = Literal["mcl", "mcl_sharp", "mixture_mcl", "mixture_mcl_sharp", "adam", "adam_sharp", "adam_robust"]
+"""``_sharp``: Eq 15 to a power (:attr:`Settings.powers`); without it, weights as the paper prints them."""
 
-COMBINATIONS: dict[str, tuple[Algorithm, str]] = {
+_BY_SCORE: dict[str, tuple[Algorithm, str]] = {
     "mcl": ("mcl", "uniform"),
     "mixture_mcl": ("mixture_mcl", "dual_features"),
     "mixture_mcl_star": ("mixture_mcl", "dual_features_star"),
@@ -49,6 +51,22 @@ COMBINATIONS: dict[str, tuple[Algorithm, str]] = {
     "adam_markov_grid": ("adam", "markov_grid"),
     "adam_markov_dsom": ("adam", "markov_dsom"),
     "adam_markov_hybrid": ("adam", "markov_hybrid"),
+}
+
+
+def sharp(method: str) -> str:
+    """Name of the method that is ``method`` with weights to a power: ``adam_dsom`` -> ``adam_sharp_dsom``.
+
+    Methods that do not weigh by Eq 15 keep their names.
+    """
+    algorithm = _BY_SCORE[method][0] if method in _BY_SCORE else ""
+    return method.replace(algorithm, f"{algorithm}_sharp", 1) if algorithm else method
+
+
+_SHARP: dict[Algorithm, Algorithm] = {"mcl": "mcl_sharp", "mixture_mcl": "mixture_mcl_sharp", "adam": "adam_sharp"}
+COMBINATIONS: dict[str, tuple[Algorithm, str]] = {
+    **_BY_SCORE,
+    **{sharp(name): (_SHARP[algorithm], source) for name, (algorithm, source) in _BY_SCORE.items()},
     "robust_dsom": ("adam_robust", "dsom"),
     "robust_likelihood_grid": ("adam_robust", "likelihood_grid"),
     "robust_hybrid": ("adam_robust", "hybrid"),
@@ -65,10 +83,13 @@ PARTS = {
     "markov_dsom": ("likelihood_grid", "dsom"),
     "markov_hybrid": ("likelihood_grid", "dsom"),
 }
-SURE = ("likelihood_grid", *PARTS)
-"""Proposals that hold the exact likelihood of a scan, or what all scans so far say."""
+EXACT = ("likelihood_grid", *PARTS)
+"""Names of the proposals that hold the exact likelihood of a scan, or what all scans so far say."""
 METHODS: tuple[str, ...] = (*COMBINATIONS, *LEARNED)
-STANDARD: tuple[str, ...] = tuple(name for name, (_, proposal) in COMBINATIONS.items() if proposal not in PARTS)
+STANDARD = (
+    "mcl", "mixture_mcl", "mixture_mcl_star", "mixture_mcl_dsom", "adam_dsom", "adam_likelihood_grid",
+    "adam_sharp_dsom", "adam_sharp_likelihood_grid", "robust_dsom", "robust_likelihood_grid",
+)  # fmt: skip
 """Methods of the standard comparison; the others have to be asked for by name."""
 
 
@@ -80,48 +101,48 @@ def network_of(method: str) -> str | None:
 
 
 WEIGHT_POWER = 8.0
-"""Default of :attr:`Settings.weight_power`."""
+"""Power of Eq 15 in the ``_sharp`` methods."""
 
 
-def powers(algorithm: str, sure: bool, weight_power: float) -> tuple[float, float]:
-    """Powers of Eq 15 by which a filter that weighs by it draws and averages; is its proposal one of :data:`SURE`?
+def sharp_powers(proposal: str, weight_power: float = WEIGHT_POWER) -> tuple[float, float]:
+    """Powers of Eq 15 by which a ``_sharp`` method draws and averages, for the proposal of that name.
 
     Draws have to leave room for places that are only likely, an average has not: it goes by 16 where draws go by 8,
-    and by 1, as printed, where they do (experiments/dsom/REPORT.md). Alg 1 with one of :data:`SURE` as its proposal
-    draws as printed and averages by ``weight_power``: PM then is as good as sure, and what gathers sooner than PM
+    and by 1, as printed, where they do (experiments/dsom/REPORT.md). With one of :data:`EXACT` draws are as printed and
+    only the average is sharpened, by ``weight_power``: PM then is as good as sure, and what gathers sooner than PM
     arrives stays at a wrong place that looks alike.
     """
-    if algorithm == "adam" and sure:
-        return 1.0, weight_power
-    return weight_power, round(weight_power ** (4 / 3), 9)
+    return (1.0, weight_power) if proposal in EXACT else (weight_power, round(weight_power ** (4 / 3), 9))
 
 
 def powers_of(method: str, weight_power: float = WEIGHT_POWER) -> tuple[float, float] | None:
-    """:func:`powers` of a method of :data:`METHODS`; None for those that do not weigh by Eq 15."""
+    """Powers by which a method of :data:`METHODS` draws and averages; None for those that do not weigh by Eq 15."""
     if method in LEARNED or COMBINATIONS[method][0] == "adam_robust":
         return None
     algorithm, proposal = COMBINATIONS[method]
-    return powers(algorithm, proposal in SURE, weight_power)
+    return sharp_powers(proposal, weight_power) if algorithm.endswith("_sharp") else (1.0, 1.0)
 
 
 @dataclass(frozen=True)
 class Settings:
     """What all filters of a comparison share; ``range_max`` of the sensor models follows the lidar.
 
+    The paper's filters are MCL, Mixture MCL and Alg 1.
+
     Attributes:
         particles: N.
         t_cut: T_cut of Alg 1.
         max_beams: beams used for weighing.
         seed: of what is random while a filter is built (the samples of Mixture MCL).
-        motion, score, raycast: drive, Eq 15 and expected ranges of the paper's filters; of a table on maps of coarse
-            cells see :func:`table_for`.
-        weight_power: particles are drawn by Eq 15 to this power, as if so many such scans had been seen; 1 as printed,
-            where a particle elsewhere weighs half as much as one at the truth (experiments/REPORT.md). Estimates
-            average by another, and Alg 1 with some proposals is an exception: :func:`powers`.
+        motion, sensor, raycast: drive, observation model and expected ranges of the paper's filters; of a table on
+            maps of coarse cells see :func:`table_for`.
+        powers: of the weights by which ``_sharp`` filters draw and average, as if so many such scans had been seen; the
+            others do both by the weights themselves, with which a particle elsewhere weighs half as much as one at
+            the truth (experiments/REPORT.md). See :func:`sharp_powers`.
         grid: the likelihood grid.
         sharpness: exponent of DSOM's PM in the paper's filters (``experiments/dsom``).
         hybrid: weights of likelihood grid and network.
-        robust, robust_motion, robust_raycast: AdaM robust; its ``particles`` are those above.
+        robust, robust_motion, robust_sensor, robust_raycast: AdaM robust; its ``particles`` are those above.
         robust_sharpness: exponent of DSOM's PM there, where draws are corrected for what they were drawn from.
         memory: AdaM robust with the likelihood grid as proposal remembers earlier scans on the grid.
         memory_share: least and greatest weight of what that memory says, beside the particles' own past.
@@ -138,14 +159,15 @@ class Settings:
     max_beams: int = 72
     seed: int = 0
     motion: Motion = OdometryMotion()
-    score: ScoreModel = ScoreModel()
+    sensor: SensorModel = ScoreModel()
     raycast: RaycastConfig = RaycastConfig("table")
     grid: LikelihoodGridConfig = LikelihoodGridConfig()
-    weight_power: float = WEIGHT_POWER
+    powers: tuple[float, float] = sharp_powers("dsom")
     sharpness: float = 3.0
     hybrid: HybridConfig = HybridConfig()
-    robust: RobustConfig = RobustConfig(model=BeamModel(0.65, 0.05, 0.05, 0.25, sigma_hit=0.1, temper=0.2))
+    robust: RobustConfig = RobustConfig()
     robust_motion: Motion = OdometryMotion(0.01, 0.01, 0.01, 0.01, 0.02, 0.015, slip=0.1, tail=0.4, tail_scale=4.0)
+    robust_sensor: SensorModel = BeamModel(0.65, 0.05, 0.05, 0.25, sigma_hit=0.1, temper=0.2)
     robust_raycast: RaycastConfig = RaycastConfig("table")
     robust_sharpness: float = 1.0
     memory: bool = False
@@ -163,7 +185,7 @@ class Settings:
         checks.share(self, "t_cut")
         checks.span(self, "memory_share")
         checks.span(self, "network_share")
-        checks.positive(self, "weight_power sharpness robust_sharpness memory_temper")
+        checks.positive(self, "sharpness robust_sharpness memory_temper")
 
 
 _SCANNED = 1.0
@@ -183,7 +205,7 @@ REAL = Settings(
 _FURNISHED = BeamModel(0.45, 0.4, 0.05, 0.1, sigma_hit=0.6)
 DRAWN = replace(
     REAL,
-    robust=replace(REAL.robust, model=replace(_FURNISHED, temper=0.1)),
+    robust_sensor=replace(_FURNISHED, temper=0.1),
     grid=replace(REAL.grid, model=replace(_FURNISHED, temper=0.1)),
 )
 """For floor plans: walls elsewhere, furniture that cuts four beams in ten short (``experiments/robust``)."""
@@ -210,8 +232,8 @@ def build_filter(
     if name in LEARNED:
         return LEARNED[name](checkpoint, grid, lidar, particles)
     algorithm, proposal = COMBINATIONS[name]
-    settings = Settings(particles=particles, t_cut=t_cut, weight_power=weight_power)
     sources, base = {} if sources is None else sources, proposal.removesuffix(_STAR)
+    settings = Settings(particles=particles, t_cut=t_cut, powers=sharp_powers(base, weight_power))
     for needed in (*PARTS.get(base, ()), base):
         if needed not in sources:
             sources[needed] = make_proposal(needed, grid, lidar, settings, checkpoint, sources)
@@ -268,35 +290,64 @@ def remembering(likelihood: LikelihoodGrid, settings: Settings) -> MarkovGrid:
     return MarkovGrid(likelihood.tempered(settings.memory_temper), settings.markov)
 
 
+SensorName = Literal["beam", "likelihood_field", "score"]
+MotionName = Literal["differential", "omni"]
+
+
+def with_sensor(settings: Settings, name: SensorName) -> Settings:
+    """The settings with another observation model, for all filters.
+
+    ``beam``: that of AdaM robust. ``likelihood_field``: nav2's default, as far from the walls as the beam model allows.
+    ``score``: Eq 15, in AdaM robust to the power of 8, as if so many such scans had been seen.
+    """
+    beam = settings.robust_sensor
+    if name == "beam":
+        model: SensorModel = beam
+    elif name == "likelihood_field":
+        own = {n: getattr(beam, n) for n in ("sigma_hit", "temper") if hasattr(beam, n)}
+        model = LikelihoodField(**own)
+    else:
+        model = ScoreModel(temper=WEIGHT_POWER)
+    return replace(settings, sensor=model, robust_sensor=model)
+
+
+def with_motion(settings: Settings, name: MotionName) -> Settings:
+    """The settings with another model of the drive, as noisy as the one that they have."""
+    if name == "differential":
+        return settings
+    both = {field: omni_like(getattr(settings, field)) for field in ("motion", "robust_motion")}
+    return replace(settings, **both)  # type: ignore[arg-type]  # fields of one type
+
+
+def within_reach(sensor: SensorModel, lidar: LidarConfig) -> SensorModel:
+    """The model for readings of a lidar: its ``range_max``, where it has one, is the lidar's."""
+    return replace(sensor, range_max=lidar.range_max) if hasattr(sensor, "range_max") else sensor  # type: ignore[type-var]
+
+
 def make_filter(
     algorithm: Algorithm, proposal: Proposal, grid: OccupancyGrid, lidar: LidarConfig, settings: Settings
 ) -> Filter:
     """Filter ``algorithm`` drawing from ``proposal``; that of a network is sharpened as ``settings`` say for it."""
-    step = -(-lidar.beams // settings.max_beams)
-    used, space = lidar.every(step), free_space(grid)
     if algorithm == "adam_robust":
-        model = replace(settings.robust.model, range_max=lidar.range_max)
-        robust = replace(settings.robust, particles=settings.particles, model=model)
-        tables = make_tables(grid, settings.robust_raycast, lidar.range_max)
-        parts = (used, step, settings.robust_motion, robust)
+        robust = replace(settings.robust, particles=settings.particles)
+        sensor = within_reach(settings.robust_sensor, lidar)
+        world = make_world(grid, lidar, settings.robust_motion, sensor, settings.robust_raycast, settings.max_beams)
         if isinstance(proposal, DSOMProposal):
             proposal = replace(proposal, sharpness=settings.robust_sharpness)
         if settings.memory and isinstance(proposal, LikelihoodGrid):
             belief = grid_belief(proposal, grid, settings.belief)
-            return AdamPlaces(tables, space, belief, *parts, settings.memory_share)
+            return AdamPlaces(world, belief, robust, settings.memory_share)
         if isinstance(proposal, MarkovGrid):
             share = settings.network_share if isinstance(proposal, MarkovNetwork) else settings.memory_share
-            return AdamMemory(tables, space, proposal, *parts, share)
-        return AdamRobust(tables, space, proposal, *parts)
-    score = replace(settings.score, range_max=lidar.range_max)
-    tables = make_tables(grid, table_for(grid.resolution, settings.raycast), lidar.range_max)
-    world = World(tables, space, used, step, settings.motion, score)
-    sure = isinstance(proposal, LikelihoodGrid | Hybrid | MarkovGrid)
-    drawn, averaged = powers(algorithm, sure, settings.weight_power)
+            return AdamMemory(world, proposal, robust, share)
+        return AdamRobust(world, proposal, robust)
+    sensor, raycast = within_reach(settings.sensor, lidar), table_for(grid.resolution, settings.raycast)
+    world = make_world(grid, lidar, settings.motion, sensor, raycast, settings.max_beams)
+    drawn, averaged = settings.powers if algorithm.endswith("_sharp") else (1.0, 1.0)
     config = FilterConfig(settings.particles, weight_power=drawn, estimate_power=averaged)
-    if algorithm == "mcl":
+    if algorithm.startswith("mcl"):
         return MCL(world, config)
-    if algorithm == "mixture_mcl":
+    if algorithm.startswith("mixture_mcl"):
         return MixtureMCL(world, proposal, config)
     return AdamMCL(world, proposal, config, settings.t_cut)
 

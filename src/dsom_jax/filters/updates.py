@@ -10,12 +10,9 @@ import jax.numpy as jnp
 
 from dsom_jax import checks
 from dsom_jax.filters.common import Info, ParticleState, describe, normalise
-from dsom_jax.lidar import LidarConfig
-from dsom_jax.proposals.uniform import FreeSpace
-from dsom_jax.raycast import MapTables, cast_rays
+from dsom_jax.filters.world import World
 from dsom_jax.resampling import Resampling, pick
-from dsom_jax.sensor import ScoreModel, beam_score, perfect_score
-from dsom_jax.types import Array, Inputs, Key, Motion, Proposal
+from dsom_jax.types import Array, Inputs, Key, Proposal
 
 Predecessor = Literal["knn", "motion"]
 _NEIGHBOURS = 3
@@ -45,33 +42,6 @@ class FilterConfig:
         checks.positive(self, "weight_power estimate_power")
         checks.choice(self, "predecessor", get_args(Predecessor))
         checks.choice(self, "resampling", get_args(Resampling))
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class World:
-    """What a filter knows: the map and the models of robot and sensor.
-
-    Attributes:
-        tables: the map.
-        space: uniform distribution over its free poses.
-        lidar: beams that are used (static); every ``beam_step``-th of the scan (static).
-        motion, score: models (static).
-    """
-
-    tables: MapTables
-    space: FreeSpace
-    lidar: LidarConfig = field(metadata={"static": True})
-    beam_step: int = field(metadata={"static": True})
-    motion: Motion = field(metadata={"static": True})
-    score: ScoreModel = field(metadata={"static": True})
-
-    def weigh(self, poses: Array, ranges: Array) -> Array:
-        """w = p(o | s) by Eq 15 for poses (N, 3), in units of w*; one if no beam of the scan is valid."""
-        seen = ranges[:: self.beam_step]
-        best = perfect_score(seen, self.score)
-        score = beam_score(seen, cast_rays(self.tables, poses, self.lidar), self.score)
-        return jnp.where(best > 0, score / jnp.where(best > 0, best, 1.0), 1.0)
 
 
 class Draw(NamedTuple):

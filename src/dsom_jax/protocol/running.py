@@ -24,6 +24,8 @@ from dsom_jax.filters.methods import (
     make_proposal,
     network_of,
     powers_of,
+    sharp,
+    sharp_powers,
 )
 from dsom_jax.judging.run_table import RunTable, read_runs, write_runs
 from dsom_jax.judging.scores import judged_by
@@ -40,7 +42,10 @@ Networks = Callable[[Variant], Path | None]
 
 
 class Builder:
-    """Filters on the map of a suite; proposals are made once for each network."""
+    """Filters on the map of a suite; proposals are made once for each network.
+
+    Whatever weighs by Eq 15 is taken sharpened (``_sharp``); plans and results name it without that.
+    """
 
     def __init__(self, plan: Plan, suite: Suite, networks: Networks) -> None:
         self.plan, self.suite, self.networks = plan, suite, networks
@@ -55,7 +60,8 @@ class Builder:
         network = checkpoint.load(folder, lidar, kind=kind) if folder and kind else None
         if variant.method in LEARNED:
             return LEARNED[variant.method](network, grid, lidar, plan.particles)
-        algorithm, source = COMBINATIONS[variant.method]
+        algorithm, source = COMBINATIONS[sharp(variant.method)]
+        settings = replace(settings, powers=sharp_powers(source.removesuffix("_star")))
         name, made = source.removesuffix("_star"), self.made.setdefault(folder, {})
         for needed in (*PARTS.get(name, ()), name):
             if needed not in made:
@@ -100,7 +106,7 @@ def identity(variant: Variant, plan: Plan, suite: Suite, start: Path | None) -> 
         "suite": suite.name, "map_kind": plan.map_kind, "runs": plan.runs, "particles": plan.particles,
         "clips": plan.clips, "updates": plan.updates, "seed": plan.seed, "laser_max_range": plan.laser_max_range,
         "map_digest": map_digest(suite.episodes[0][1]), "clips_digest": clips_digest(suite),
-        "start_digest": start and checkpoint.digest(start), "powers": report.plain(powers_of(variant.method)),
+        "start_digest": start and checkpoint.digest(start), "powers": report.plain(powers_of(sharp(variant.method))),
     }  # fmt: skip
 
 
