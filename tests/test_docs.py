@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import math
 import re
 import shlex
@@ -80,12 +81,34 @@ def test_code_of_the_pages_runs(name, tmp_path, monkeypatch):
     exec(compile(code, str(page), "exec", dont_inherit=True), {"__name__": "page"})
 
 
-def test_public_names_exist():
-    for name in dsom_jax.__all__:
-        assert getattr(dsom_jax, name) is not None
-    assert set(dsom_jax.__all__) <= set(dir(dsom_jax))
+def name_space(name):
+    """Modules and names of the stub of a package, from which they are imported lazily and editors read them."""
+    tree = ast.parse((Path(dsom_jax.__file__).parent / name / "__init__.pyi").read_text())
+    homes = {}
+    for node in tree.body:
+        if isinstance(node, ast.ImportFrom):
+            homes |= {alias.name: node.module for alias in node.names}
+    return homes
+
+
+@pytest.mark.parametrize("name", ["", "filters", "proposals"])
+def test_public_names_are_what_the_stub_says(name):
+    package = import_module(f"dsom_jax.{name}".rstrip("."))
+    homes = name_space(name)
+    assert sorted(homes) == sorted(package.__all__) and set(homes) <= set(dir(package))
+    for word, module in homes.items():
+        home = import_module(f"{package.__name__}.{module}") if module else None
+        expected = getattr(home, word) if home else import_module(f"{package.__name__}.{word}")
+        assert getattr(package, word) is expected, word
     with pytest.raises(AttributeError, match="nothing_of_the_kind"):
-        _ = dsom_jax.nothing_of_the_kind
+        _ = package.nothing_of_the_kind
+    assert name or 35 <= len(homes) <= 55
+
+
+@pytest.mark.parametrize("name", ["maps", "logs", "simulate", "nn", "plotting"])
+def test_names_of_a_space_are_in_it(name):
+    space = import_module(f"dsom_jax.{name}")
+    assert all(hasattr(space, word) for word in space.__all__) and space.__all__ == sorted(space.__all__)
 
 
 def test_import_is_light():

@@ -18,7 +18,7 @@ LAYERS = (
     ("proposals",),
     ("belief",),
     ("filters", "training", "montecarlo", "ambiguity"),
-    ("atomic", "data", "checkpoint", "run_folder", "trained", "plotting", "report", "judging", "view"),
+    ("atomic", "data", "checkpoint", "run_folder", "trained", "plotting", "report", "judging", "view", "maps", "logs"),
     ("live",),
     (
         "__main__",

@@ -15,7 +15,7 @@ from dsom_jax.filters.adam import AdamMCL
 from dsom_jax.filters.adam_memory import AdamMemory
 from dsom_jax.filters.adam_robust import AdamRobust, RobustConfig, RobustState
 from dsom_jax.filters.methods import Settings, build_filter, make_filter
-from dsom_jax.filters.world import make_world
+from dsom_jax.filters.world import World
 from dsom_jax.geometry import compose, inverse, wrap_angle
 from dsom_jax.montecarlo import run, run_keys
 from dsom_jax.motion import OdometryMotion
@@ -150,7 +150,7 @@ def test_log_prior_is_the_density_of_the_belief_before_the_scan(memory):
 @pytest.fixture(scope="module")
 def filters(memory):
     grid = tiny_world.grid()
-    world = make_world(grid, LIDAR, OdometryMotion(), BEAM, RaycastConfig("table", angles=72))
+    world = World.on(grid, LIDAR, OdometryMotion(), BEAM, RaycastConfig("table", angles=72))
     config = RobustConfig(particles=150)
     return AdamMemory(world, memory, config), AdamRobust(world, memory.likelihood, config)
 

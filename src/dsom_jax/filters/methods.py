@@ -22,7 +22,7 @@ from dsom_jax.filters.mixture import MixtureMCL
 from dsom_jax.filters.pf_net import pf_net
 from dsom_jax.filters.pfrnn import pfrnn
 from dsom_jax.filters.updates import FilterConfig
-from dsom_jax.filters.world import make_world
+from dsom_jax.filters.world import World
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.motion import OdometryMotion, omni_like
 from dsom_jax.occupancy import OccupancyGrid
@@ -331,7 +331,7 @@ def make_filter(
     if algorithm == "adam_robust":
         robust = replace(settings.robust, particles=settings.particles)
         sensor = within_reach(settings.robust_sensor, lidar)
-        world = make_world(grid, lidar, settings.robust_motion, sensor, settings.robust_raycast, settings.max_beams)
+        world = World.on(grid, lidar, settings.robust_motion, sensor, settings.robust_raycast, settings.max_beams)
         if isinstance(proposal, DSOMProposal):
             proposal = replace(proposal, sharpness=settings.robust_sharpness)
         if settings.memory and isinstance(proposal, LikelihoodGrid):
@@ -342,7 +342,7 @@ def make_filter(
             return AdamMemory(world, proposal, robust, share)
         return AdamRobust(world, proposal, robust)
     sensor, raycast = within_reach(settings.sensor, lidar), table_for(grid.resolution, settings.raycast)
-    world = make_world(grid, lidar, settings.motion, sensor, raycast, settings.max_beams)
+    world = World.on(grid, lidar, settings.motion, sensor, raycast, settings.max_beams)
     drawn, averaged = settings.powers if algorithm.endswith("_sharp") else (1.0, 1.0)
     config = FilterConfig(settings.particles, weight_power=drawn, estimate_power=averaged)
     if algorithm.startswith("mcl"):

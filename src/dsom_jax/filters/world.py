@@ -46,16 +46,16 @@ class World:
         """Weights (N,) of poses (N, 3) in units of the best possible one, w / w* for Eq 15."""
         return self.sensor.weigh(self.tables, poses, ranges[:: self.beam_step])
 
-
-def make_world(
-    grid: OccupancyGrid,
-    lidar: LidarConfig,
-    motion: Motion,
-    sensor: SensorModel,
-    raycast: RaycastConfig = TABLE,
-    max_beams: int = 72,
-) -> World:
-    """World of a map: its tables are computed here; of a scan with more than ``max_beams`` every n-th beam is used."""
-    step = -(-lidar.beams // max_beams)
-    rays = RayTables(make_tables(grid, raycast, lidar.range_max), lidar.every(step))
-    return World(grid, free_space(grid), sensor.tables(rays), step, motion, sensor)
+    @staticmethod
+    def on(
+        grid: OccupancyGrid,
+        lidar: LidarConfig,
+        motion: Motion,
+        sensor: SensorModel,
+        raycast: RaycastConfig = TABLE,
+        max_beams: int = 72,
+    ) -> World:
+        """World of a map, its tables computed; of a scan with more than ``max_beams`` every n-th beam is used."""
+        step = -(-lidar.beams // max_beams)
+        rays = RayTables(make_tables(grid, raycast, lidar.range_max), lidar.every(step))
+        return World(grid, free_space(grid), sensor.tables(rays), step, motion, sensor)
