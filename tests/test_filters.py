@@ -16,6 +16,7 @@ import tiny_world
 from dsom_jax import montecarlo
 from dsom_jax.episode import Episode
 from dsom_jax.filters.adam import AdamMCL
+from dsom_jax.filters.adam_robust import RobustState
 from dsom_jax.filters.common import ParticleState, heaviest_cluster
 from dsom_jax.filters.mcl import MCL
 from dsom_jax.filters.methods import Settings, make_filter, with_motion, with_sensor
@@ -277,3 +278,67 @@ def test_a_drive_that_moves_sideways_is_chosen_by_name(grid):
     assert with_motion(Settings(), "differential") == Settings()
     for name, own in (("mcl", Settings().motion), ("adam_robust", Settings().robust_motion)):
         assert make_filter(name, free_space(grid), grid, LIDAR, settings).world.motion == omni_like(own)
+
+
+@pytest.mark.parametrize("resampling", ["systematic", "multinomial"])
+def test_kept_particles_descend_from_kept_ones(resampling, world, spot, episode):
+    """Alg 1, line 11: h is sampled from H, however heavy those are that are not in it."""
+    config = replace(MCL_ONLY, resampling=resampling)
+    f = AdamMCL(replace(world, motion=STILL), spot, config, t_cut=0.6)
+    here, there = episode.poses[0], episode.poses[9]
+    poses = jnp.where(jnp.arange(64)[:, None] < 32, here, there)
+    trust = jnp.where(jnp.arange(64) < 32, 0.9, 0.0)
+    state = ParticleState(poses, trust, jnp.where(jnp.arange(64) < 32, 1e-3, 1.0), jnp.int32(1))
+    after, info = step(f, jax.random.key(0), state, at(episode, 0)._replace(odometry=jnp.zeros(3)))
+    assert float(info.redrawn) == 0.5
+    np.testing.assert_allclose(after.poses[:32], jnp.broadcast_to(here, (32, 3)), atol=1e-5)
+    assert in_spot(spot, after.poses[32:]).mean() > 0.9
+
+
+@pytest.mark.parametrize("injection", [0.0, 0.25, 1.0])
+def test_mcl_injects_its_share_of_random_particles(injection, world, episode):
+    f = MCL(replace(world, motion=STILL), MCL_ONLY, injection)
+    poses = jnp.broadcast_to(episode.poses[0], (64, 3))
+    state = ParticleState(poses, jnp.ones(64), jnp.full(64, 1 / 64), jnp.int32(1))
+    after, _ = step(f, jax.random.key(0), state, at(episode, 0)._replace(odometry=jnp.zeros(3)))
+    away = np.hypot(*np.asarray(after.poses - poses)[:, :2].T) > 1e-4
+    assert away.sum() == round(64 * injection)
+    assert away[:: max(1, round(1 / max(injection, 1e-9)))].all() or injection == 0  # spread over the whole set
+
+
+@pytest.mark.parametrize("lost", [0.8, 0.3])
+def test_a_lost_filter_leaves_out_a_share_of_the_evidence(lost, world, spot, episode):
+    """log w = prior + (1 - caution * lost) log p(z | x): of the same draws, all differences are the evidence's."""
+    n, now, caution = 64, at(episode, 2), 0.5
+    poses, _ = world.space.sample(jax.random.key(5), None, n)
+    state = RobustState(poses, jnp.full(n, -np.log(n), jnp.float32), jnp.float32(lost), jnp.int32(3))
+    weighed = []
+    for share in (0.0, caution):
+        f = robust(world, spot, n, caution=share)
+        after, _ = step(f, jax.random.key(1), state, now)
+        weighed.append(np.asarray(after.log_weights, np.float64))
+    evidence = np.asarray(f.world.log_likelihood(after.poses, now.ranges), np.float64)
+    alive = np.isfinite(weighed[0]) & np.isfinite(weighed[1])
+    rest = (weighed[1] - weighed[0] + caution * lost * evidence)[alive]
+    assert alive.sum() > 20 and np.ptp(evidence[alive]) > 1
+    np.testing.assert_allclose(rest, rest.mean(), atol=2e-3)
+
+
+def test_the_heaviest_cluster_is_the_mean_of_its_members_and_no_particle():
+    rng = np.random.default_rng(1)
+    poses = np.array([2.0, -1.0, 0.5]) + rng.normal(0, [0.2, 0.2, 0.05], (120, 3))
+    weights = rng.uniform(0.1, 1.0, 120)
+    weights /= weights.sum()
+    centre, mass = jax.jit(heaviest_cluster)(jnp.asarray(poses, jnp.float32), jnp.asarray(weights, jnp.float32))
+    # All lie within 1 m and 20 deg of their mean, so that it is the mean of the cluster.
+    np.testing.assert_allclose(centre, weights @ poses, atol=1e-4)
+    assert float(mass) == pytest.approx(1.0, abs=1e-5)
+
+
+def test_a_cluster_is_found_from_its_edge():
+    """The one candidate lies 0.8 m to one side of most of the weight; two mean shifts go there."""
+    poses = np.zeros((120, 3))
+    poses[:, 0] = np.linspace(0, 1.6, 120)
+    weights = np.full(120, 1 / 120)
+    centre, _ = jax.jit(heaviest_cluster)(jnp.asarray(poses, jnp.float32), jnp.asarray(weights, jnp.float32))
+    assert abs(float(centre[0]) - 0.8) < 0.02

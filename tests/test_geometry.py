@@ -124,3 +124,20 @@ def test_circular_mean_is_the_argument_of_the_resultant(theta, weights):
     mean = np.asarray(geometry.circular_mean(jnp.asarray(theta), jnp.asarray(weights)))
     known = np.abs(resultant) > 1e-2
     assert (se2.angle_gap(mean, np.angle(resultant))[known] < 1e-4).all()
+
+
+@given(poses(()), poses(()))
+def test_headings_are_wrapped(a, b):
+    """Also where both headings lie beyond the seam: all functions of poses give angles in [-pi, pi)."""
+    a, b = jnp.asarray(a), jnp.asarray(b)
+    for pose in (geometry.compose(a, b), geometry.relative(a, b), geometry.inverse(a)):
+        assert -PI <= float(pose[2]) < PI
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "sum_", "difference"), [(3.0, 3.0, -0.283185, 0.0), (-3.0, 3.0, 0.0, -0.283185)]
+)
+def test_headings_across_the_seam_by_hand(one, other, sum_, difference):
+    a, b = jnp.array([0.0, 0.0, one]), jnp.array([0.0, 0.0, other])
+    assert float(geometry.compose(a, b)[2]) == pytest.approx(sum_, abs=1e-5)
+    assert float(geometry.relative(a, b)[2]) == pytest.approx(difference, abs=1e-5)

@@ -275,3 +275,15 @@ def test_methods_with_the_memory_are_offered(memory):
         own = {"particles": 20, "t_cut": 0.6, "sources": made}
         built = build_filter(name, tiny_world.grid(), LIDAR, **own)
         assert isinstance(built, kind) and built.proposal.likelihood.expected is memory.likelihood.expected
+
+
+def test_a_robot_may_have_been_carried_anywhere(room):
+    """The prior of an update holds ``kidnap`` of an even belief, wherever the belief before it was."""
+    belief = jnp.zeros_like(room.begin()).at[0, 0].set(1.0)
+    blind = Inputs(jnp.full(LIDAR.beams, jnp.nan), jnp.zeros(3), jnp.int32(4))
+    prepared, after = room.prepare(belief, blind)
+    cells, headings = int((np.asarray(room.begin()) > 0).sum()), room.likelihood.config.headings
+    far = np.asarray(after)[room.likelihood.free.sum() - 1, headings // 2]
+    assert far == pytest.approx(1e-4 / cells, rel=1e-3)
+    assert float(np.asarray(after).sum()) == pytest.approx(1.0, abs=1e-5)
+    np.testing.assert_allclose(prepared.prior.mass, prepared.posterior.mass, rtol=1e-5)

@@ -170,3 +170,12 @@ def test_the_tail_is_wider_noise_for_some():
 def test_an_omnidirectional_drive_like_another_is_as_noisy():
     own = OdometryMotion(0.01, 0.02, 0.03, 0.04, 0.05, 0.06, slip=0.1)
     assert omni_like(own) == OmniMotion(0.01, 0.02, 0.03, 0.04, alpha5=0.03, min_xy=0.05, min_theta=0.06)
+
+
+@pytest.mark.parametrize(("travel", "counts"), [(0.008, False), (0.012, True), (0.05, True)])
+def test_the_direction_of_less_than_a_centimetre_is_no_turn(travel, counts):
+    """nav2: a step to the side is a turn of 90 degrees and back, with its noise, from 1 cm on."""
+    model = OdometryMotion(0.2, 0.0, 0.0, 0.0, min_xy=0.0, min_theta=0.0)
+    _, sigma = model.spread(jnp.array([0.0, travel, 0.0]))
+    expected = np.sqrt(0.2) * np.pi / 2 if counts else 0.0
+    np.testing.assert_allclose(sigma, [expected, 0.0, expected], atol=1e-6)
