@@ -3,6 +3,7 @@
 from dsom_jax.data import (
     RawLog,
     Trajectory,
+    associate,
     load_bag,
     load_carmen,
     load_log,
@@ -22,6 +23,7 @@ __all__ = [
     "RawLog",
     "Suite",
     "Trajectory",
+    "associate",
     "load_bag",
     "load_carmen",
     "load_log",
