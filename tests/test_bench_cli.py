@@ -184,7 +184,7 @@ def test_per_run_values_are_those_of_the_table(suite, monkeypatch, tmp_path):
 
 def test_default_methods_are_those_that_can_be_run(tmp_path):
     assert "adam_dsom" not in bench.chosen_methods("", None) and "mcl" in bench.chosen_methods("", None)
-    assert bench.chosen_methods("", tmp_path) == bench.STANDARD and len(bench.STANDARD) == 8
+    assert bench.chosen_methods("", tmp_path) == bench.STANDARD and len(bench.STANDARD) == 10
     assert bench.chosen_methods("robust_hybrid", tmp_path) == ("robust_hybrid",)
     assert bench.chosen_methods("mcl,mcl", None) == ("mcl",)
 
