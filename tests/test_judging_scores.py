@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dsom_jax.belief.verdict import Verdict
-from dsom_jax.data import load_tum
+from dsom_jax.data import load_tum, se2
 from dsom_jax.episode import Episode
 from dsom_jax.judging import scores as judging
 from dsom_jax.judging.rooms import rooms_of
@@ -134,3 +134,39 @@ def test_the_estimate_is_the_cluster_of_run_0_and_of_two_segments_the_earlier_co
     clusters = [np.asarray(o.result.info.cluster)[0] for o in (early, later)]
     np.testing.assert_allclose(saved.poses[:24], clusters[0], atol=1e-6)
     np.testing.assert_allclose(saved.poses[24:], clusters[1][14:], atol=1e-6)
+
+
+def framed(shift: tuple[float, float, float], off: float, seed: int = 0) -> tuple[Drive, judging.Replies]:
+    """Three runs that know the pose to 0.05 m; the reference lies in a frame that ``shift`` carries onto the map.
+
+    A share ``off`` of the answers is anywhere.
+    """
+    rng = np.random.default_rng(seed)
+    truth = np.column_stack([rng.uniform(0, 9, (UPDATES, 2)), rng.uniform(-3, 3, UPDATES)])
+    answers = truth + rng.normal(0, [0.05, 0.05, 0.02], (3, UPDATES, 3))
+    wild = rng.random((3, UPDATES)) < off
+    answers[wild] = rng.uniform(-30, 30, (int(wild.sum()), 3))
+    told = jnp.asarray(se2.compose(se2.inverse(np.array(shift)), truth))
+    blank = jnp.zeros((UPDATES, 3))
+    episode = Episode(blank, blank, told, jnp.zeros(UPDATES, bool), jnp.zeros(UPDATES))
+    return Drive(episode, np.arange(UPDATES)), judging.Replies(answers, certain=np.ones((3, UPDATES), bool))
+
+
+def shift_of(*framed: tuple[Drive, judging.Replies]) -> dict | None:
+    return judging.reference_shift([drive for drive, _ in framed], [said for _, said in framed])
+
+
+@pytest.mark.parametrize("shift", [(15.05, 15.05, 0.0), (-3.0, 0.5, 1.2), (0.0, 40.0, 3.1)])
+def test_a_reference_in_another_frame_is_found_out(shift):
+    found = shift_of(framed(shift, 0.2), framed(shift, 0.0, seed=1))
+    # Medians of some 140 answers that scatter by 0.05 m and 0.02 rad are good to three times 0.005 m and 0.0021 rad;
+    # an error of the turn moves what is far from the origin.
+    lever = np.hypot(*shift[:2]) * bool(shift[2])
+    np.testing.assert_allclose([found["x"], found["y"]], shift[:2], atol=0.015 + 0.0063 * (lever + 10))
+    np.testing.assert_allclose(found["theta"], shift[2], atol=0.0063)
+    assert found["share"] > 0.85
+
+
+def test_no_shift_is_named_where_none_is_needed_or_fits():
+    assert shift_of(framed((0.0, 0.0, 0.0), 0.2)) is None
+    assert shift_of(framed((30.0, 0.0, 0.0), 1.0)) is None

@@ -33,8 +33,8 @@ _FRAME = re.compile(r"\x1b\[[0-9;]*m|[│╭╮╰╯]|^\s*[|+]|[|+]\s*$")
 """Frames of boxes; terminals that know ASCII only get them from | + and -."""
 
 
-def parse(arguments: type[T], prog: str) -> T:
-    """The dataclass ``arguments`` from the words of the command line; UserError for words that do not fit it.
+def parse(arguments: type[T], prog: str, words: Sequence[str] | None = None) -> T:
+    """The dataclass ``arguments`` from ``words``, those of the command line; UserError for words that do not fit it.
 
     ``prog`` is what the user typed before them, such as ``python -m dsom_jax.bench``. What is compiled from here on is
     kept for the next time.
@@ -43,7 +43,7 @@ def parse(arguments: type[T], prog: str) -> T:
     box = io.StringIO()
     try:
         with redirect_stderr(box):
-            return tyro.cli(arguments, prog=prog, description=arguments.__doc__)
+            return tyro.cli(arguments, args=words, prog=prog, description=arguments.__doc__)
     except SystemExit as stop:
         if stop.code != 2:
             raise

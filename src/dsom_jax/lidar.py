@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dsom_jax import checks
+from dsom_jax.errors import shown
 from dsom_jax.types import Array, Key
 
 
@@ -39,14 +40,19 @@ class LidarConfig:
     def __post_init__(self) -> None:
         checks.count(self, "beams")
         checks.finite(self, "angle_min angle_increment")
-        if not (_finite(self.mount) and len(self.mount) == 3):
-            raise ValueError(checks.message(self, "mount", "give x and y in metres and yaw in radians"))
-        if not (_finite((self.range_min, self.range_max)) and 0 <= self.range_min < self.range_max):
-            raise ValueError(f"LidarConfig: need 0 <= range_min < range_max, got {self.range_min}, {self.range_max} m")
+        near = _finite(self.mount) and len(self.mount) == 3 and max(map(abs, self.mount[:2])) <= 100
+        if not (near and abs(self.mount[2]) <= 2 * math.pi + 1e-3):
+            fix = "give x and y in metres, at most 100, and yaw in radians, within a turn (90 deg is 1.5708)"
+            raise ValueError(checks.message(self, "mount", fix))
+        if not (_finite((self.range_min, self.range_max)) and 0 <= self.range_min < self.range_max <= 1e5):
+            ranges = f"{shown(self.range_min)}, {shown(self.range_max)} m"
+            raise ValueError(f"need 0 <= range_min < range_max <= 100 km, got {ranges}")
+        if self.beams > 1 and self.angle_increment == 0:
+            raise ValueError(checks.message(self, "angle_increment", "give the angle between beams in radians"))
         spanned = (self.beams - 1) * abs(self.angle_increment)
         if abs(self.angle_min) > 2 * math.pi + 1e-3 or spanned > 2 * math.pi * 1.01:
             first, step = self.angle_min, self.angle_increment
-            span = f"LidarConfig: angle_min = {first:g}, {self.beams} beams with angle_increment = {step:g}"
+            span = f"angle_min = {first:g}, {self.beams} beams with angle_increment = {step:g}"
             raise ValueError(f"{span}: beams span more than a turn. Did you pass degrees instead of radians?")
 
     @property
@@ -86,7 +92,7 @@ class LidarNoise:
 
 
 def _finite(values: tuple[float, ...]) -> bool:
-    return all(isinstance(v, Real) and math.isfinite(v) for v in values)
+    return all(isinstance(v, Real) and abs(v) < math.inf for v in values)
 
 
 def apply_limits(ranges: Array, lidar: LidarConfig) -> Array:

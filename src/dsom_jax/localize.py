@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -23,7 +24,7 @@ from dsom_jax.cli import each, parse, stage
 from dsom_jax.data import LogOptions, RawLog, Report, load_log, load_map
 from dsom_jax.data.cut import segment_indices, splice, to_episode, without_repeats
 from dsom_jax.data.log import STILL, limited
-from dsom_jax.errors import UserError, run_cli
+from dsom_jax.errors import UserError, one_line, run_cli
 from dsom_jax.filters.methods import (
     DRAWN,
     REAL,
@@ -37,7 +38,17 @@ from dsom_jax.filters.methods import (
 from dsom_jax.judging import metrics
 from dsom_jax.judging.foreign import named, replies_of
 from dsom_jax.judging.rooms import rooms_of
-from dsom_jax.judging.scores import Drive, Outcome, Replies, judged_by, replies, save_estimate, scores, verdicts
+from dsom_jax.judging.scores import (
+    Drive,
+    Outcome,
+    Replies,
+    judged_by,
+    reference_shift,
+    replies,
+    save_estimate,
+    scores,
+    verdicts,
+)  # fmt: skip
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.montecarlo import run, run_keys
 from dsom_jax.occupancy import OccupancyGrid
@@ -129,7 +140,7 @@ def answer(args: Args, carried: Sequence[float] = ()) -> dict[str, Any]:
     log = limited(log, args.laser_max_range)
     reports = ((args.map, left_out), (args.log, log.report))
     notes = [f"{file.name}: {line}" for file, report_of in reports for line in report_of.lines()]
-    print("".join(f"{note}\n" for note in notes), end="", file=sys.stderr if args.json else sys.stdout)
+    tell(notes, args)
     drives = [marked(drive, carried) for drive in cut(log, args)]
     others = {name: replies_of(path, drives) for name, path in named(args.external, "FILE.tum").items()}
     on_plan = carried_over(drives, args.reference_on_plan)
@@ -138,12 +149,23 @@ def answer(args: Args, carried: Sequence[float] = ()) -> dict[str, Any]:
     with stage("expected ranges from every place of the map"):
         filter = jax.block_until_ready(build(args, grid, log.lidar, network))
     outcomes = localize(filter, each(drives, "segments"), args.runs, args.seed)
-    summary = summary_of(outcomes, grid, args, on_plan, others) | {"notes": notes}
+    summary = summary_of(outcomes, grid, args, on_plan, others)
+    given = [replies(outcome.result.info, judged_by(args.method)) for outcome in outcomes]
+    found = reference_notes(summary, reference_shift(drives, given))
+    tell(found, args)
+    notes += found
+    summary["notes"] = notes
     with stage("writing the page"):
         report.write_json(folder / "summary.json", summary)
         save_estimate(folder / "estimate.tum", outcomes)
         write_view(folder, outcomes, grid, log.lidar, summary, notes, args)
     return summary
+
+
+def tell(notes: list[str], args: Args) -> None:
+    """Print notes, one a line, where they do not get into the JSON."""
+    for note in notes:
+        print(one_line(note), file=sys.stderr if args.json else sys.stdout)
 
 
 def marked(drive: Drive, carried: Sequence[float]) -> Drive:
@@ -308,6 +330,23 @@ def summary_of(
 
     external = {name: judged(theirs) for name, theirs in (others or {}).items()}
     return head | judged(given) | ({"external": external} if external else {})
+
+
+def reference_notes(summary: dict[str, Any], shift: dict[str, float] | None) -> list[str]:
+    """What is to be said about the frame of the reference; ``shift`` carries it onto the answers, if one does."""
+    on_map = [part["on_map"] for part in summary.get("by_segment", ()) if part["on_map"] is not None]
+    notes = []
+    if on_map and np.mean(on_map) < 0.5:
+        notes.append(f"reference: lies on free cells of the map at {np.mean(on_map):.0%} of its poses only")
+    if shift is not None:
+        moved = f"({shift['x']:.2f}, {shift['y']:.2f}) m, {math.degrees(shift['theta']):.1f} deg"
+        notes.append(
+            f"reference: is in another frame: moved by {moved} it agrees with {shift['share']:.0%} of the sure answers "
+            "(or the map looks the same there); move it, or correct the origin of the map"
+        )
+    elif notes:
+        notes.append("reference: no shift makes it agree with the answers; check that it is of this map and this drive")
+    return notes
 
 
 COLUMNS = (

@@ -10,10 +10,12 @@ Values that do not exist (a mean over no runs) are null. ``runs.npz`` (``--per-r
 
 from __future__ import annotations
 
+import atexit
 import json
 import math
 import tempfile
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -31,13 +33,22 @@ def output_folder(path: str | Path) -> Path:
     """``path`` as a folder that exists and takes files; UserError otherwise. Call it before any work is done."""
     folder = Path(path)
     try:
+        new = not folder.exists()
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
-    except OSError as error:
-        reason = error.strerror or str(error)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
         raise UserError(f"--out {folder}: cannot write there ({reason}): name a folder that can be written") from None
+    if new:
+        atexit.register(_remove_empty, folder)
     return folder
+
+
+def _remove_empty(folder: Path) -> None:
+    """A command that was interrupted leaves no empty folder behind."""
+    with suppress(OSError):
+        folder.rmdir()
 
 
 def write_text(path: Path, text: str) -> None:

@@ -14,6 +14,8 @@ import numpy as np
 from dsom_jax.data import se2
 from dsom_jax.data.assemble import Sensor, assemble
 from dsom_jax.data.bag_reference import REFERENCES, reference_of
+from dsom_jax.data.documents import read_yaml
+from dsom_jax.data.files import check_file
 from dsom_jax.data.log import RawLog, Report
 from dsom_jax.data.log_options import AS_TOLD, LogOptions, option
 from dsom_jax.data.scans import Scans, table
@@ -96,8 +98,10 @@ def open_bag(path: Path) -> Iterator[Any]:
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
         raise UserError(f"{path}: reading bags needs rosbags; run: pip install 'dsom-jax[bags]'") from None
-    if not path.exists():
-        raise UserError(f"{path}: no such bag; check the path")
+    if not path.is_dir():
+        check_file(path, "bag")
+    elif (path / "metadata.yaml").exists():
+        read_yaml(path / "metadata.yaml", "description of the bag")  # bounded, as that of the library is not
     try:
         reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
         reader.open()

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
 import numpy as np
+from msgspec import Meta
 
-from dsom_jax.data.documents import read_yaml
-from dsom_jax.data.range_codes import detect_no_return
+from dsom_jax.data.documents import fields_as, read_yaml
+from dsom_jax.data.range_codes import ABSURD, detect_no_return
 from dsom_jax.errors import UserError
 from dsom_jax.lidar import LidarConfig
 
@@ -18,8 +20,32 @@ INCREMENT_DEG = {181: 1.0, 180: 1.0, 361: 0.5, 360: 0.5, 401: 0.25, 400: 0.25}
 """CARMEN's table for messages without angles (carmen_laser_guess_angle_increment); else 180 deg / (beams - 1)."""
 
 
-NUMBERS = ("angle_min", "angle_increment", "range_min", "range_no_return")
-"""Numeric fields of ``meta.yaml`` beside a log; ``mount`` and ``upside_down`` are read too."""
+Radians = Annotated[float, Meta(ge=-2 * math.pi - 1e-3, le=2 * math.pi + 1e-3)]
+Metres = Annotated[float, Meta(ge=-100, le=100)]
+
+
+@dataclass(frozen=True)
+class LogMeta:
+    """Fields of ``meta.yaml`` beside a log, for what the log itself does not say; those left out are None.
+
+    Attributes:
+        beams: ranges in a scan; must be those of the log.
+        angle_min, angle_increment: bearing of the first beam and between beams, radians.
+        range_min, range_no_return: metres; from the second on a reading is no return.
+        mount: pose (x, y, yaw) of the lidar on the base.
+        upside_down: whether it hangs head down.
+    """
+
+    beams: Annotated[int | None, Meta(description="the whole number of ranges in a scan")] = None
+    angle_min: Annotated[float | None, Meta(description="a number of radians")] = None
+    angle_increment: Annotated[float | None, Meta(description="a number of radians, not 0")] = None
+    range_min: Annotated[float | None, Meta(description="a number of metres")] = None
+    range_no_return: Annotated[float | None, Meta(description="a number of metres")] = None
+    mount: Annotated[
+        tuple[Metres, Metres, Radians] | None,
+        Meta(description="[x, y, yaw] in metres and radians, at most 100 m and one turn (90 deg is 1.5708)"),
+    ] = None
+    upside_down: Annotated[bool | None, Meta(description="true or false")] = None
 
 
 @dataclass(frozen=True)
@@ -52,24 +78,29 @@ def lidar_of(
     range_max: float | None,
 ) -> LidarConfig:
     """Lidar of scans (N, B): the caller's ``range_max``, then ``meta.yaml``, then the log's messages, then a guess."""
+    ranges = np.where(ranges < ABSURD, ranges, np.inf)
     meta = _meta(path.parent / "meta.yaml", ranges.shape[1])
-    limit = range_max or _no_return(meta.get("range_no_return"), _stated_limit(config, params, ranges), ranges)
+    limit = range_max or _no_return(meta.range_no_return, _stated_limit(config, params, ranges), ranges)
     longest = ranges[np.isfinite(ranges)].max(initial=0.0)
     offset = (_float(params.get("robot_frontlaser_offset")) or 0.0, 0.0, 0.0)
-    pose = offset if mount is None else tuple(float(v) for v in mount)
     try:
         return LidarConfig(
             beams=ranges.shape[1],
-            angle_min=float(meta.get("angle_min", config.start_angle)),
-            angle_increment=float(meta.get("angle_increment", config.resolution)),
-            range_min=float(meta.get("range_min", 0.0)),
+            angle_min=_first(meta.angle_min, config.start_angle),
+            angle_increment=_first(meta.angle_increment, config.resolution),
+            range_min=_first(meta.range_min, 0.0),
             # Without any no-return value every reading is a wall.
             range_max=float(limit or max(longest + 0.01, 1.0)),
-            mount=tuple(meta.get("mount", pose)),
-            upside_down=bool(meta.get("upside_down", False)),
+            mount=meta.mount or (offset if mount is None else (float(mount[0]), float(mount[1]), float(mount[2]))),
+            upside_down=bool(meta.upside_down),
         )
     except (ValueError, TypeError) as error:
-        raise UserError(f"{path}: {error}; put the right angles into meta.yaml beside the log") from None
+        raise UserError(f"{path}: {error}; put the right value into meta.yaml beside the log") from None
+
+
+def _first(described: float | None, stated: float) -> float:
+    """What ``meta.yaml`` says, or else the log."""
+    return stated if described is None else described
 
 
 def _no_return(described: float | None, stated: float | None, ranges: np.ndarray) -> float | None:
@@ -80,23 +111,19 @@ def _no_return(described: float | None, stated: float | None, ranges: np.ndarray
     return min((limit for limit in (stated, detected) if limit is not None), default=None)
 
 
-def _meta(path: Path, beams: int) -> dict[str, Any]:
+def _meta(path: Path, beams: int) -> LogMeta:
     """Fields of ``meta.yaml``, empty where there is none; its beams must be those of the log."""
-    fields = read_yaml(path, "description of the log") if path.is_file() else {}
-    if fields.get("beams", beams) != beams:
+    meta = fields_as(LogMeta, read_yaml(path, "description of the log"), path) if os.path.lexists(path) else LogMeta()
+    if meta.beams not in (None, beams):
         raise UserError(
-            f"{path}: beams = {fields['beams']}, but the scans of the log beside it have {beams}: "
+            f"{path}: beams = {meta.beams}, but the scans of the log beside it have {beams}: "
             "wrong lidar for the log; correct beams and the angles or remove the file"
         )
-    known = {name: fields[name] for name in (*NUMBERS, "mount", "upside_down") if name in fields}
-    for name, value in known.items():
-        wanted, right = ("a number", isinstance(value, int | float))
-        if name == "mount":
-            wanted = "[x, y, yaw] in metres and radians"
-            right = isinstance(value, list) and len(value) == 3 and all(isinstance(v, int | float) for v in value)
-        if not right:
-            raise UserError(f"{path}: {name} = {value!r}: must be {wanted}")
-    return known
+    for name in ("angle_min", "angle_increment", "range_min", "range_no_return"):
+        value = getattr(meta, name)
+        if value is not None and (not math.isfinite(value) or (name == "angle_increment" and not value)):
+            raise UserError(f"{path}: {name} = {value:g}: must be a finite number{', not 0' * (not value)}")
+    return meta
 
 
 def _stated_limit(config: LaserConfig, params: dict[str, str], ranges: np.ndarray) -> float | None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import jax.numpy as jnp
 import numpy as np
 
@@ -22,7 +24,7 @@ def thin(log: RawLog, update_min_d: float = 0.25, update_min_a: float = 0.2) -> 
     for n in range(1, len(log)):
         k = used[-1]
         turned = abs((theta[n] - theta[k] + np.pi) % (2 * np.pi) - np.pi)
-        if (x[n] - x[k]) ** 2 + (y[n] - y[k]) ** 2 >= update_min_d**2 or turned >= update_min_a or broken[n]:
+        if math.hypot(x[n] - x[k], y[n] - y[k]) >= update_min_d or turned >= update_min_a or broken[n]:
             used.append(n)
     return np.array(used, int)
 

@@ -18,10 +18,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from dsom_jax.data import se2
-from dsom_jax.data.files import check_near, read_bytes
+from dsom_jax.data.files import CELLS, MB, check_near, hushed, read_bytes
 from dsom_jax.data.log import Report
 from dsom_jax.data.rasterize import enclosed, reachable, touched_cells
-from dsom_jax.errors import UserError
+from dsom_jax.errors import UserError, one_line, shown
 from dsom_jax.occupancy import OccupancyGrid, from_cells
 
 UNITS = {"mm": 0.001, "cm": 0.01, "dm": 0.1, "m": 1.0, "km": 1000.0, "in": 0.0254, "ft": 0.3048, "yd": 0.9144}
@@ -29,7 +29,10 @@ UNITS = {"mm": 0.001, "cm": 0.01, "dm": 0.1, "m": 1.0, "km": 1000.0, "in": 0.025
 INSUNITS = {1: "in", 2: "ft", 4: "mm", 5: "cm", 6: "m", 7: "km", 10: "yd", 14: "dm"}
 """Codes of the header variable $INSUNITS (DXF reference); 0 says nothing."""
 DRAWN = ("LINE", "LWPOLYLINE", "POLYLINE", "ARC", "CIRCLE", "ELLIPSE", "SPLINE", "SOLID", "TRACE", "3DFACE")
-MAX_CELLS = 100_000_000
+MAX_SIDE = 100_000
+"""Cells along one side of a map."""
+MAX_INSERTED, MAX_LINES = 250_000, 1_000_000
+"""Entities that come out of blocks, and pieces of lines, in one drawing."""
 MARGIN = 2
 """Cells around the drawing, so that what is outside hangs together."""
 
@@ -61,18 +64,20 @@ class Drawing:
     pose: tuple[float, ...] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        if not (self.resolution > 0 and math.isfinite(self.resolution)):
-            raise ValueError(f"resolution = {self.resolution}: must be a positive number of metres per cell")
+        if not 1e-3 <= self.resolution <= 10:
+            raise ValueError(f"resolution = {self.resolution}: must be a positive number of metres, 0.001 to 10")
         for name in ("clearance", "sight"):
             if not (getattr(self, name) >= 0 and math.isfinite(getattr(self, name))):
                 raise ValueError(f"{name} = {getattr(self, name)}: must be metres, not negative")
         if self.units and self.units not in UNITS:
-            raise ValueError(f"units = {self.units!r}: choose one of {', '.join(UNITS)}")
+            raise ValueError(f"units = {shown(self.units)}: choose one of {', '.join(UNITS)}")
         for name in ("layers", "exclude"):
             if not all(isinstance(layer, str) for layer in getattr(self, name)):
-                raise ValueError(f"{name} = {list(getattr(self, name))!r}: must be a list of names of layers")
+                raise ValueError(f"{name} = {shown(list(getattr(self, name)))}: must be a list of names of layers")
         for name, wanted in (("start", "x, y"), ("crop", "x_min, y_min, x_max, y_max"), ("pose", "x, y, yaw")):
             _check_numbers(name, getattr(self, name), wanted, optional=name != "pose")
+        if not abs(self.pose[2]) <= 2 * math.pi + 1e-3:
+            raise ValueError(f"pose = {list(self.pose)}: yaw is in radians, within a turn (90 deg is 1.5708)")
         if self.crop and not (self.crop[0] < self.crop[2] and self.crop[1] < self.crop[3]):
             raise ValueError(f"crop = {list(self.crop)}: need x_min < x_max and y_min < y_max")
 
@@ -81,7 +86,7 @@ def _check_numbers(name: str, values: Any, wanted: str, optional: bool) -> None:
     """ValueError unless ``values`` are as many finite numbers as ``wanted`` names."""
     numbers = all(isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) for v in values)
     if not (numbers and len(values) == wanted.count(",") + 1) and not (optional and not len(values)):
-        raise ValueError(f"{name} = {list(values)!r}: must be [{wanted}]")
+        raise ValueError(f"{name} = {shown(list(values))}: must be [{wanted}]")
 
 
 def load_drawing(path: str | Path, drawing: Drawing | None = None, report: Report | None = None) -> OccupancyGrid:
@@ -91,21 +96,36 @@ def load_drawing(path: str | Path, drawing: Drawing | None = None, report: Repor
     what was left out.
     """
     path, drawing, report = Path(path), drawing or Drawing(), report if report is not None else Report()
-    document = _open(path)
-    scale = _metres_per_unit(path, document, drawing.units)
-    flat = 0.1 * drawing.resolution / scale
-    try:
-        lines = list(_segments(document, drawing, flat, report))
-    except RecursionError:
-        raise UserError(f"{path}: a block contains itself; repair the drawing in a CAD program") from None
-    segments = scale * np.array(lines, float).reshape(-1, 2, 2)
-    if not len(segments):
-        names = ", ".join(sorted(layer.dxf.name for layer in document.layers))
-        raise UserError(f"{path}: nothing to draw; layers are {names}: check layers and exclude")
+    segments, scale = _lines(path, drawing, report)
     corner, shape = _extent(path, segments, drawing.resolution)
     occupied = touched_cells((segments - corner) / drawing.resolution, shape)
     free = _floor(path, occupied, drawing, scale, corner)
     return _grid(path, occupied, free, drawing, scale, corner)
+
+
+def _lines(path: Path, drawing: Drawing, report: Report) -> tuple[np.ndarray, float]:
+    """Segments (N, 2, 2) of a file in metres, and what one unit of its coordinates is in metres."""
+    try:
+        with hushed("ezdxf"):
+            document = _open(path)
+            scale = _metres_per_unit(path, document, drawing.units)
+            _check_expansion(path, document, drawing)
+            parts, count = [], 0
+            for part in _segments(document, drawing, drawing.resolution / scale, report):
+                parts.append(part)
+                count += len(part)
+                if count > MAX_LINES:
+                    raise UserError(f"{path}: more than {MAX_LINES:,} pieces of lines; exclude layers, crop it in CAD")
+            if not count:
+                names = ", ".join(sorted(layer.dxf.name for layer in document.layers))
+                raise UserError(f"{path}: nothing to draw; layers are {names}: check layers and exclude")
+    except (UserError, MemoryError):
+        raise
+    except Exception as error:
+        # Broken files surface as whatever the tag in question raises: DXF errors, ValueError, KeyError, ...
+        cause = one_line(str(error), 120) or "broken tags"
+        raise UserError(f"{path}: not a readable DXF drawing ({cause}); save it again as DXF") from None
+    return scale * np.concatenate(parts), scale
 
 
 def _open(path: Path) -> Any:
@@ -115,49 +135,92 @@ def _open(path: Path) -> Any:
         from ezdxf import recover
     except ImportError:
         raise UserError(f"{path}: reading drawings needs ezdxf; run: pip install 'dsom-jax[drawings]'") from None
-    content = read_bytes(path, "drawing")
+    content = read_bytes(path, "drawing", 100 * MB)
     if content[:2] == b"AC" and content[2:6].isdigit():
         raise UserError(f"{path}: is a DWG, not a DXF; save it as DXF in a CAD program")
     if not content.strip():
         raise UserError(f"{path}: is empty, not a DXF drawing; copy it again")
     try:
         return ezdxf.readfile(path)
-    except Exception:
-        pass
-    try:
+    except Exception:  # what it is will be said by the second reader, which repairs where it can
         return recover.readfile(path)[0]
-    except Exception as error:
-        # Broken files surface as whatever the tag in question raises: DXF errors, ValueError, KeyError, ...
-        cause = (str(error) or type(error).__name__).splitlines()[0]
-        raise UserError(f"{path}: not a readable DXF drawing ({cause}); save it again as DXF") from None
+
+
+def _check_expansion(path: Path, document: Any, drawing: Drawing) -> None:
+    """UserError if blocks, with what is inserted in them, and arrays of them stand for too many entities."""
+    inserts = [
+        entity for entity in document.modelspace().query("INSERT") if not _matches(entity.dxf.layer, drawing.exclude)
+    ]
+    try:
+        count = _expanded(inserts, {})
+    except RecursionError:
+        count = math.inf
+    if count == math.inf:
+        raise UserError(f"{path}: a block contains itself; repair the drawing in a CAD program")
+    if count > MAX_INSERTED:
+        raise UserError(
+            f"{path}: its blocks and arrays stand for {count:.1e} entities, the limit is {MAX_INSERTED:,}; "
+            "exclude the layer they are inserted on, or repair the drawing in a CAD program"
+        )
+
+
+def _expanded(entities: Any, sizes: dict[str, float]) -> float:
+    """How many entities ``entities`` are once blocks are expanded; infinitely many where one contains itself.
+
+    ``sizes`` keeps what is known of each block, so that the work is that of the file, not of what it stands for.
+    """
+    total = 0.0
+    for entity in entities:
+        if entity.dxftype() != "INSERT":
+            total += 1
+            continue
+        name = str(entity.dxf.get("name", "")).lower()
+        if name not in sizes:
+            sizes[name] = math.inf  # until it is known: whoever asks meanwhile is inside of it
+            block = entity.block()
+            sizes[name] = 0.0 if block is None else _expanded(block, sizes)
+        if sizes[name]:
+            total += max(1, entity.mcount) * sizes[name]
+    return total
 
 
 def _metres_per_unit(path: Path, document: Any, units: str) -> float:
     """What one unit of the coordinates is in metres."""
-    code = int(document.header.get("$INSUNITS", 0))
+    code = document.header.get("$INSUNITS", 0)
     if not units and code not in INSUNITS:
         raise UserError(
-            f"{path}: does not say its unit ($INSUNITS = {code}); name it in a yaml: drawing: {path.name}, units: m"
+            f"{path}: does not say its unit ($INSUNITS = {shown(code)}); "
+            f"name it in a yaml: drawing: {path.name}, units: m"
         )
     return UNITS[units or INSUNITS[code]]
 
 
-def _segments(document: Any, drawing: Drawing, flat: float, report: Report) -> Iterator[np.ndarray]:
-    """Line segments (2, 2) in the drawing's coordinates; curves are within ``flat`` of theirs."""
+def _segments(document: Any, drawing: Drawing, cell: float, report: Report) -> Iterator[np.ndarray]:
+    """Line segments (N, 2, 2) of each entity in the drawing's coordinates; curves are within a tenth of a cell."""
     from ezdxf import path as paths
 
     for entity in _visible(document, document.modelspace(), drawing, report, layer=None):
         try:
             # Arcs come as Bezier curves, exact to 3e-4 of their radius.
-            points = [(p.x, p.y) for p in paths.make_path(entity).flattening(flat)]
-        except (TypeError, ValueError, ArithmeticError):
+            curve = paths.make_path(entity)
+            ends = _plane(curve.control_vertices())
+            if np.isfinite(ends).all() and np.ptp(ends, axis=0).max(initial=0) <= MAX_SIDE * cell:
+                ends = _plane(curve.flattening(0.1 * cell))
+        except MemoryError:
+            raise
+        except Exception:
+            # What is missing or mistyped in an entity surfaces as any kind of error.
             report.add(f"{entity.dxftype()} entities that cannot be drawn")
             continue
-        ends = np.array(points, float).reshape(-1, 2)
         if not np.isfinite(ends).all():
             report.add(f"{entity.dxftype()} entities without finite coordinates")
             continue
-        yield from np.stack([ends[:-1], ends[1:]], axis=1)
+        yield np.stack([ends[:-1], ends[1:]], axis=1)
+
+
+def _plane(points: Any) -> np.ndarray:
+    """(N, 2) points seen from above."""
+    return np.array([(p.x, p.y) for p in points], float).reshape(-1, 2)
 
 
 def _visible(document: Any, entities: Any, drawing: Drawing, report: Report, layer: str | None) -> Iterator[Any]:
@@ -213,9 +276,9 @@ def _extent(path: Path, segments: np.ndarray, resolution: float) -> tuple[np.nda
     """Lower-left corner (2,) in metres and shape of the grid around all lines."""
     low, high = segments.min((0, 1)) / resolution, segments.max((0, 1)) / resolution
     first = np.round(low) - MARGIN - 0.5
-    width, height = (math.ceil(side) + MARGIN for side in (high - first).tolist())
-    if width * height > MAX_CELLS:
-        metres = " m x ".join(f"{side * resolution:.0f}" for side in (width, height))
+    width, height = (math.ceil(min(side, 1e12)) + MARGIN for side in (high - first).tolist())
+    if max(width, height) > MAX_SIDE or width * height > CELLS:
+        metres = " m x ".join(f"{side * resolution:.6g}" for side in (width, height))
         raise UserError(
             f"{path}: {metres} m at resolution = {resolution} m is {width * height:.1e} cells; check units, exclude "
             "the layer of what lies far away, or give a coarser resolution"
@@ -229,8 +292,8 @@ def _floor(path: Path, occupied: np.ndarray, drawing: Drawing, scale: float, cor
         free = enclosed(occupied, drawing.clearance / drawing.resolution)
         fix = "the outline has gaps: give start = [x, y] inside, or draw the layer of the doors"
     else:
-        j, i = np.floor((scale * np.array(drawing.start) - corner) / drawing.resolution).astype(int)
-        free = reachable(occupied, (int(i), int(j)))
+        cell = np.floor((scale * np.array(drawing.start) - corner) / drawing.resolution).clip(-1, MAX_SIDE)
+        free = reachable(occupied, (int(cell[1]), int(cell[0])))
         fix = f"start = {list(drawing.start)} lies on a line or outside of the drawing"
     if not free.any():
         raise UserError(f"{path}: no free cell; {fix}")

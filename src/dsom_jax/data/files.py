@@ -69,13 +69,26 @@ def check_file(path: str | Path, what: str) -> None:
         raise _unreadable(path, what, PermissionError(errno.EACCES, os.strerror(errno.EACCES)))
 
 
+def check_path(path: str | Path, what: str) -> None:
+    """UserError for a name that no file can have, and for a file in a folder that may not be entered; one that is not
+    there passes, whoever opens it will say so."""
+    try:
+        mode = os.stat(path).st_mode
+    except (FileNotFoundError, NotADirectoryError):
+        return
+    except (OSError, ValueError) as error:
+        raise _unreadable(path, what, error) from None
+    if stat.S_ISDIR(mode) and not os.access(path, os.R_OK | os.X_OK):
+        raise _unreadable(path, what, PermissionError(errno.EACCES, os.strerror(errno.EACCES)))
+
+
 def _unreadable(path: str | Path, what: str, error: OSError | ValueError) -> UserError:
     """Why a path cannot be opened; ValueErrors are those of names that hold a NUL."""
     number = error.errno if isinstance(error, OSError) else None
     if number in (errno.ENOENT, errno.ENOTDIR):
         return UserError(f"{path}: no such {what}; check the path")
     if number is None or number == errno.ENAMETOOLONG:
-        name = f"{str(path)[:60]}{'...' * (len(str(path)) > 60)}"
+        name = f"{'...' * (len(str(path)) > 60)}{str(path)[-60:]}"
         return UserError(f"{name}: no file has such a name ({len(str(path))} characters); check the path of the {what}")
     return UserError(f"{path}: cannot read the {what} ({os.strerror(number)}); check its permissions")
 

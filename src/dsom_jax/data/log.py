@@ -105,7 +105,8 @@ def limit_ranges(ranges: np.ndarray, range_min: float, no_return: float) -> np.n
 
     Exact zeros and negative numbers are no distances; drivers mean errors by them: NaN.
     """
-    ranges = np.asarray(ranges, np.float32).copy()
+    with np.errstate(over="ignore"):  # FLT_MAX and more is infinite, as it is meant
+        ranges = np.array(ranges, np.float32)
     wrong = (ranges <= 0) & ~np.isneginf(ranges)
     ranges[ranges < range_min] = -np.inf
     ranges[ranges >= np.float32(no_return)] = np.inf

@@ -9,6 +9,7 @@ import numpy as np
 
 from dsom_jax.data.bag import SUFFIXES, is_bag, load_bag
 from dsom_jax.data.carmen import load_carmen
+from dsom_jax.data.files import check_path
 from dsom_jax.data.log import RawLog, check_lidar, report_still
 from dsom_jax.data.log_options import AS_TOLD, LogOptions, apart_from_bags
 from dsom_jax.data.rawseeds import is_rawseeds, load_rawseeds
@@ -30,6 +31,7 @@ def load_log(
     Readings from ``range_max`` metres on count as no return; by default the log tells.
     """
     path = Path(path)
+    check_path(path, "log")
     if range_max is not None and not 0 < range_max < float("inf"):
         raise UserError(f"range_max = {range_max}: must be a positive number of metres")
     log = _load(path, options, range_max)

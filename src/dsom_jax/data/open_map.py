@@ -9,9 +9,10 @@ from dsom_jax.data.bag import is_bag
 from dsom_jax.data.bag_map import load_bag_map
 from dsom_jax.data.documents import read_yaml
 from dsom_jax.data.dxf import Drawing, load_drawing
+from dsom_jax.data.files import check_path
 from dsom_jax.data.log import Report
 from dsom_jax.data.ros_map import load_ros_map
-from dsom_jax.errors import UserError
+from dsom_jax.errors import UserError, shown
 from dsom_jax.occupancy import OccupancyGrid, resample
 from dsom_jax.training.options import override
 
@@ -22,6 +23,7 @@ def load_map(path: str | Path, report: Report | None = None) -> OccupancyGrid:
     A drawing that is named without a yaml is read with the defaults. ``report`` takes what was left out or is odd.
     """
     path = Path(path)
+    check_path(path, "map")
     if is_bag(path):
         return load_bag_map(path, report)
     if path.suffix.lower() in (".dxf", ".dwg"):
@@ -31,7 +33,7 @@ def load_map(path: str | Path, report: Report | None = None) -> OccupancyGrid:
         return load_ros_map(path, report=report)
     plan = fields.pop("drawing")
     if not isinstance(plan, str):
-        raise UserError(f"{path}: drawing = {plan!r}: must be the name of a DXF file")
+        raise UserError(f"{path}: drawing = {shown(plan)}: must be the name of a DXF file")
     return load_drawing(path.parent / plan, override(Drawing(), fields, str(path)), report)
 
 

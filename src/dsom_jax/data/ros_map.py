@@ -121,7 +121,7 @@ def read_map_info(path: str | Path, report: Report | None = None) -> MapInfo:
 def _image(path: Path, named: Path, report: Report) -> Path:
     """The picture that the yaml names, or that of the same name beside the yaml: absolute paths do not travel."""
     told = path.parent / os.path.expanduser(named)
-    beside = path.with_name(ntpath.basename(str(named)) or "map.pgm")
+    beside = path.parent / ntpath.basename(str(named))
     if os.path.isfile(told) or not os.path.isfile(beside):
         return told
     report.add(f"image {one_line(str(named), 120)} is not there: {beside.name} beside the yaml is taken")

@@ -18,7 +18,6 @@ A TOML suite has one table per drive, and one lidar for all of them; only ``map`
 from __future__ import annotations
 
 import io
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from importlib.resources import files
@@ -30,10 +29,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from dsom_jax.atomic import write_atomic
-from dsom_jax.data.files import read_bytes
+from dsom_jax.data.documents import read_toml
+from dsom_jax.data.files import read_arrays
 from dsom_jax.data.open_map import load_map
 from dsom_jax.episode import Episode
-from dsom_jax.errors import UserError
+from dsom_jax.errors import UserError, shown
 from dsom_jax.lidar import LidarConfig, LidarNoise
 from dsom_jax.occupancy import OccupancyGrid, from_cells, resample
 from dsom_jax.simulate.drive import DriveConfig, make_synthetic
@@ -99,11 +99,15 @@ def encode(suite: Suite) -> bytes:
 
 def decode(name: str, content: bytes) -> Suite:
     """The suite that :func:`encode` wrote."""
+    data = read_arrays(content, f"suite {name}")
     try:
-        with np.load(io.BytesIO(content), allow_pickle=False) as stored:
-            data = {key: stored[key] for key in stored.files}
-    except (ValueError, OSError, EOFError) as error:
+        return _decode(name, data)
+    except (ValueError, TypeError, KeyError, IndexError, AttributeError, ArithmeticError) as error:
         raise UserError(f"suite {name}: its file is damaged ({error}); install the package again") from None
+
+
+def _decode(name: str, data: dict[str, np.ndarray]) -> Suite:
+    """The suite in the arrays of :func:`encode`."""
     beams, angle_min, increment, range_max = data["lidar"].tolist()
     grids = [_unpack(data, number) for number in range(len(data["names"]))]
     names = [str(n) for n in data["names"]]
@@ -147,10 +151,7 @@ def _from_millimetres(codes: np.ndarray) -> np.ndarray:
 
 
 def _from_toml(path: Path) -> Suite:
-    try:
-        document = tomllib.loads(read_bytes(path, "suite file").decode())
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise UserError(f"{path}: not valid TOML ({error}); see the example in docs of dsom_jax.data.suite") from None
+    document = read_toml(path, "suite file")
     _known(path, "the suite", document, ("name", "lidar", "episodes"))
     entries = document.get("episodes")
     if not isinstance(entries, list) or not entries or not all(isinstance(e, Mapping) for e in entries):
@@ -168,7 +169,7 @@ def _known(path: Path, where: str, table: Mapping[str, Any], allowed: tuple[str,
 
 def _lidar(path: Path, table: Any) -> LidarConfig:
     if not isinstance(table, Mapping):
-        raise UserError(f"{path}: lidar = {table!r}: must be a table [lidar]")
+        raise UserError(f"{path}: lidar = {shown(table)}: must be a table [lidar]")
     _known(path, "lidar", table, tuple(f.name for f in fields(LidarConfig)))
     values: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in table.items()}
     try:
@@ -198,7 +199,7 @@ def _drive(path: Path, where: str, entry: Mapping[str, Any], lidar: LidarConfig)
             values[field] = _number(path, where, entry, field, 0, whole=field in ("obstacles", "removed"))
     updates = entry.get("updates", [70, 70])
     if not isinstance(updates, list) or not all(type(n) is int for n in updates):
-        raise UserError(f"{path}: {where}: updates = {updates!r}: must be a list of whole numbers such as [70, 70]")
+        raise UserError(f"{path}: {where}: updates = {shown(updates)}: must be whole numbers such as [70, 70]")
     noise = LidarNoise(sigma=_number(path, where, entry, "range_sigma", 0.03))
     try:
         return replace(DriveConfig(lidar=lidar, lidar_noise=noise), updates=tuple(updates), **values)
@@ -237,7 +238,7 @@ def _number(
     """A field that must be a number and not negative."""
     value = entry.get(field, default)
     if isinstance(value, bool) or not isinstance(value, int if whole else (int, float)) or not 0 <= value < 2**31:
-        raise UserError(f"{path}: {where}: {field} = {value!r}: must be a {'whole ' * whole}number, not negative")
+        raise UserError(f"{path}: {where}: {field} = {shown(value)}: must be a {'whole ' * whole}number, not negative")
     if positive and not value:
         raise UserError(f"{path}: {where}: {field} = {value!r}: must be positive")
     return value

@@ -9,8 +9,8 @@ import numpy as np
 
 from dsom_jax.atomic import write_atomic
 from dsom_jax.data import se2
-from dsom_jax.data.files import read_bytes
-from dsom_jax.data.log import RawLog
+from dsom_jax.data.files import FAR, MB, check_near, read_lines
+from dsom_jax.data.log import RawLog, Report
 from dsom_jax.errors import UserError
 
 
@@ -37,7 +37,7 @@ def yaw_of(quaternion: np.ndarray) -> np.ndarray:
 def load_tum(path: str | Path) -> Trajectory:
     """Trajectory of a TUM file; comments and empty lines are skipped, rows are sorted by stamp."""
     rows = []
-    for number, line in enumerate(read_bytes(path, "trajectory").decode(errors="replace").splitlines(), start=1):
+    for number, line in enumerate(read_lines(path, "trajectory", 64 * MB), start=1):
         words = line.split("#")[0].replace(",", " ").split()
         if words:
             rows.append(_row(path, number, words))
@@ -45,7 +45,12 @@ def load_tum(path: str | Path) -> Trajectory:
         raise UserError(f"{path}: holds no pose; each line must be 'stamp x y z qx qy qz qw'")
     table = np.array(rows)
     table = table[np.argsort(table[:, 0], kind="stable")]
-    return Trajectory(table[:, 0], np.column_stack([table[:, 1:3], yaw_of(table[:, 4:8])]))
+    far = np.abs(table[:, 1:3]).max(axis=1) > FAR
+    if far.any():
+        x, y = table[far][0, 1:3].tolist()
+        check_near(path, (x, y), "take the same offset from it and from the origin of the map")
+    turns = table[:, 4:8] / np.abs(table[:, 4:8]).max(axis=1, keepdims=True)
+    return Trajectory(table[:, 0], np.column_stack([table[:, 1:3], yaw_of(turns)]))
 
 
 def _row(path: str | Path, number: int, words: list[str]) -> list[float]:
@@ -87,9 +92,29 @@ def associate(trajectory: Trajectory, stamps: np.ndarray, tolerance: float = 0.0
     return np.where(close[:, None], trajectory.poses[nearest], poses)
 
 
+def one_pose_a_stamp(trajectory: Trajectory, path: str | Path, report: Report) -> Trajectory:
+    """The trajectory without stamps at which it is in several places (5 cm, 1 deg); UserError if there are many.
+
+    That is what becomes of stamps that are printed with too few digits: one pose of many would be taken for all.
+    """
+    first = np.searchsorted(trajectory.stamps, trajectory.stamps)
+    apart = np.abs(se2.relative(trajectory.poses[first], trajectory.poses))
+    elsewhere = (apart > [0.05, 0.05, np.radians(1)]).any(-1)
+    torn = np.isin(trajectory.stamps, trajectory.stamps[elsewhere])
+    if torn.sum() > max(2, len(torn) // 20):
+        raise UserError(
+            f"{path}: {torn.sum()} of {len(torn)} poses share their stamp with a pose elsewhere (first at "
+            f"{trajectory.stamps[torn][0]:.3f} s); write the stamps with all their digits, at least 3 after the point"
+        )
+    if torn.any():
+        kind = "poses of the reference dropped that share their stamp with a pose elsewhere"
+        report.add(kind, f"at {trajectory.stamps[torn][0]:.3f} s", int(torn.sum()))
+    return Trajectory(trajectory.stamps[~torn], trajectory.poses[~torn])
+
+
 def with_reference(log: RawLog, path: str | Path, tolerance: float = 0.01, max_gap: float = 1.0) -> RawLog:
     """The log with the reference trajectory of a TUM file; it is an error if no scan finds its pose."""
-    trajectory = load_tum(path)
+    trajectory = one_pose_a_stamp(load_tum(path), path, log.report)
     poses = associate(trajectory, log.stamps, tolerance, max_gap)
     missing = int(np.isnan(poses).any(-1).sum())
     if missing == len(log):

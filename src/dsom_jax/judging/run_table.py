@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dsom_jax.atomic import write_atomic
+from dsom_jax.data.files import read_arrays
 from dsom_jax.errors import UserError
 from dsom_jax.judging.metrics import Runs, ratio
 
@@ -111,10 +111,9 @@ def write_runs(path: Path, table: RunTable, **more: np.ndarray) -> None:
 
 def read_runs(path: str | Path) -> RunTable:
     """The table that :func:`write_runs` wrote."""
-    try:
-        with np.load(path) as columns:
-            return RunTable(*(columns[name] for name in RunTable._fields))
-    except FileNotFoundError:
-        raise UserError(f"{path}: no such table of runs; make it with bench --per-run") from None
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
-        raise UserError(f"{path}: not a table of runs; make it again with bench --per-run") from None
+    columns = read_arrays(path, "table of runs of bench --per-run")
+    table = RunTable(*(columns.get(name, np.zeros((0, 0))) for name in RunTable._fields))
+    kinds = {column.dtype.kind for column in table[2:]} | {table.method.dtype.kind + table.phase.dtype.kind}
+    if not kinds <= set("iufb") | {"UU"} or len({column.shape for column in table}) > 1 or table.run.ndim != 1:
+        raise UserError(f"{path}: not a table of runs (other columns); make it again with bench --per-run")
+    return table

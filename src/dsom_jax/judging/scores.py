@@ -138,6 +138,36 @@ def describe(drive: Drive, runs: metrics.Runs, grid: OccupancyGrid) -> dict[str,
     }
 
 
+def reference_shift(drives: Sequence[Drive], given: Sequence[Replies]) -> dict[str, float] | None:
+    """The one motion of the map frame that carries the reference onto the answers, if one does and is needed.
+
+    x, y (m), theta (rad) and ``share``, of the sure answers those within 0.5 m and 10 deg of the reference so moved.
+    None where answers and reference agree as they are (a tenth of them within 2 m), or no motion fits half of them.
+    """
+    truth, answer = _sure(drives, given)
+    if len(truth) < 10 or np.mean(np.hypot(*(answer - truth)[:, :2].T) < 2.0) > 0.1:
+        return None
+    turns = np.exp(1j * (answer[:, 2] - truth[:, 2]))
+    theta = float(np.angle(np.median(turns.real) + 1j * np.median(turns.imag)))
+    theta = theta if abs(theta) > math.radians(2) else 0.0
+    turned = (truth[:, 0] + 1j * truth[:, 1]) * np.exp(1j * theta)
+    offset = answer[:, 0] + 1j * answer[:, 1] - turned
+    x, y = float(np.median(offset.real)), float(np.median(offset.imag))
+    fits = (np.abs(offset - (x + 1j * y)) < 0.5) & (np.abs(np.angle(turns * np.exp(-1j * theta))) < math.radians(10))
+    return {"x": x, "y": y, "theta": theta, "share": float(fits.mean())} if fits.mean() > 0.5 else None
+
+
+def _sure(drives: Sequence[Drive], given: Sequence[Replies]) -> tuple[np.ndarray, np.ndarray]:
+    """Reference and answers (N, 3) at all updates of all runs with both, and where the system claims to know."""
+    pairs = []
+    for drive, said in zip(drives, given, strict=True):
+        truth = np.broadcast_to(np.asarray(drive.episode.poses), said.poses.shape)
+        sure = np.isfinite(truth).all(-1) & np.isfinite(said.poses).all(-1)
+        sure &= True if said.certain is None else said.certain
+        pairs.append((truth[sure], said.poses[sure]))
+    return np.concatenate([p[0] for p in pairs]), np.concatenate([p[1] for p in pairs])
+
+
 def save_estimate(path: Path, outcomes: list[Outcome]) -> None:
     """Heaviest cluster of run 0 at every update, in log time; of overlapping segments the earlier one counts."""
     stamps = np.concatenate([o.drive.stamps for o in outcomes])
