@@ -71,10 +71,12 @@ def test_a_perfect_answer_shows_no_sign():
 def test_a_turned_lidar_shows_as_a_crab():
     signs, track = watched(math.radians(20))
     crab = math.atan2(abs(float(track.cross)), float(track.along))
-    assert crab == pytest.approx(math.radians(20), abs=0.07)
-    backwards, track = watched(math.pi)
-    assert math.atan2(abs(float(track.cross)), float(track.along)) == pytest.approx(math.pi, abs=0.1)
-    assert float(backwards.stretch) > float(signs.stretch)
+    assert crab == pytest.approx(math.radians(20), abs=0.07) and float(signs.backward) == 0
+    # Turned right round, every step is answered backwards; the way itself is straight.
+    signs, track = watched(math.pi)
+    assert float(track.back) == pytest.approx(float(track.path)) and float(track.path) > 1
+    assert float(signs.backward) == pytest.approx(float(track.path) / (float(track.path) + 0.3))
+    assert math.atan2(abs(float(track.cross)), float(track.along)) < 0.1
 
 
 def test_a_jump_is_no_step():
@@ -112,8 +114,8 @@ def test_the_shipped_head_is_whole():
 def test_doubt_by_hand():
     head = v.Head(2.0, tuple(0.5 if name == "long" else 0.25 for name in Signs._fields[2:]))
     signs = CLEAN._replace(long=jnp.float32(0.5), crab=jnp.float32(0.25), miss=jnp.float32(-1.0))
-    assert float(v.doubt(signs, head)) == pytest.approx(2**0.25)
-    faulty = 1 / (1 + math.exp(-2 * (2**0.25 - 1)))
+    assert float(v.doubt(signs, head)) == pytest.approx(2**0.125)
+    faulty = 1 / (1 + math.exp(-2 * (2**0.125 - 1)))
     assert float(v.p_lost(signs, head)) == pytest.approx(faulty, abs=1e-6)
     # At one of two equal places an answer is right in half of all cases, at best.
     torn = signs._replace(elsewhere=jnp.float32(0.5), scattered=jnp.float32(0.1))

@@ -16,6 +16,8 @@ from dsom_jax.marching import empty_squares
 from dsom_jax.raycast import MapTables, cast_rays
 from dsom_jax.types import Array
 
+_MINUTES = 0.97
+"""Share of the past that an update keeps of the way driven backwards."""
 _TOLERANCE = 0.3
 """Metres within which a return is where the map has a wall."""
 
@@ -65,7 +67,9 @@ class Track(NamedTuple):
     Attributes:
         pose: (3,) the last answer.
         fit: (5,) faded sums of what :class:`Fit` holds, by known beams, and ``weight`` () of all of it.
-        cross, along, squared: () faded sums of reported x answered steps: crosswise, along, and of the reported ones.
+        cross, along, squared: () faded sums of reported x answered steps: crosswise, along, and of the reported ones;
+            a step that was answered backwards counts as one forth, as some encoders do not tell the two apart.
+        back, path: () metres answered backwards, and all, in the last minutes.
         slide, turn: () faded sums of squared gaps between reported and answered steps (m^2) and turns (rad^2).
         count: () faded number of steps.
         jump: () faded number of steps that no odometry explains.
@@ -77,6 +81,8 @@ class Track(NamedTuple):
     cross: Array
     along: Array
     squared: Array
+    back: Array
+    path: Array
     slide: Array
     turn: Array
     count: Array
@@ -94,6 +100,7 @@ class Signs(NamedTuple):
         unknown: share of the beams that look into unknown space; faded.
         blind: share of the beams that say nothing, faded.
         crab: angle between the reported steps and the answered ones, radians.
+        backward: share of the way that was answered backwards.
         stretch: by what share answered steps are longer or shorter than reported ones.
         slide: reported and answered steps differ by this share of a step.
         turn: root mean square of the gap between reported and answered turns, radians.
@@ -110,6 +117,7 @@ class Signs(NamedTuple):
     unknown: Array
     blind: Array
     crab: Array
+    backward: Array
     stretch: Array
     slide: Array
     turn: Array
@@ -139,7 +147,7 @@ class Monitor:
     def start(self) -> Track:
         """Nothing seen."""
         zero = jnp.float32(0.0)
-        return Track(jnp.zeros(3), jnp.zeros(5), *[zero] * 8)
+        return Track(jnp.zeros(3), jnp.zeros(5), *[zero] * 10)
 
     def watch(
         self,
@@ -170,16 +178,21 @@ class Monitor:
         gap = wrap_angle(step[2] - odometry[2])
         c, s = jnp.cos(gap / 2), jnp.sin(gap / 2)
         x, y = c * step[0] + s * step[1], c * step[1] - s * step[0]
-        off = jnp.hypot(x - odometry[0], y - odometry[1])
-        travel = jnp.hypot(odometry[0], odometry[1])
-        jumped = (off > jnp.maximum(1.0, 2.5 * travel)) | (jnp.abs(gap) > 0.7)
+        told = jnp.where(jnp.isfinite(odometry), odometry, 0.0)
+        travel = jnp.hypot(told[0], told[1])
+        backward = told[0] * x + told[1] * y < -0.5 * travel**2
+        told = jnp.where(backward, -1.0, 1.0) * told
+        off = jnp.hypot(x - told[0], y - told[1])
+        jumped = (off > jnp.maximum(1.0, 1.5 * travel)) | (jnp.abs(gap) > 0.7)
         keep = jnp.where(first, 0.0, self.slow)
         use = jnp.where(first | jumped | ~jnp.isfinite(odometry).all(), 0.0, 1.0)
-        told = jnp.where(jnp.isfinite(odometry), odometry, 0.0)
+        long = jnp.where(first, 0.0, _MINUTES)
         return track._replace(
             cross=keep * track.cross + use * (told[0] * y - told[1] * x),
             along=keep * track.along + use * (told[0] * x + told[1] * y),
             squared=keep * track.squared + use * travel**2,
+            back=long * track.back + use * travel * backward,
+            path=long * track.path + use * travel,
             slide=keep * track.slide + use * jnp.where(use > 0, off, 0.0) ** 2,
             turn=keep * track.turn + use * gap**2,
             count=keep * track.count + use,
@@ -203,6 +216,7 @@ class Monitor:
             unknown=unknown,
             blind=1 - known,
             crab=sure * crab,
+            backward=track.path / (track.path + 0.3) * track.back / jnp.maximum(track.path, 1e-6),
             stretch=sure * jnp.abs(ratio - 1),
             slide=sure * jnp.sqrt(track.slide / jnp.maximum(track.count, 1e-6) / (steps + 0.01)),
             turn=jnp.sqrt(track.turn / jnp.maximum(track.count, 1.0)),

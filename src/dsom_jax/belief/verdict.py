@@ -3,7 +3,7 @@
 ``p_lost`` is the probability that the answer is more than 2 m or 10 deg off. It is right if it is at the right one of
 the places that the belief considers, and if belief, map and robot are what they seem. The first is a share of the
 belief; of the second any one sign of :mod:`dsom_jax.belief.monitor` is enough to doubt: each is measured in its own
-tolerance, and the doubt is their 4-norm, a smooth maximum. No sign of trouble can make an answer more credible. The
+tolerance, and the doubt is their 8-norm, a smooth maximum. No sign of trouble can make an answer more credible. The
 tolerances are set and trimmed on simulated drives alone (``experiments/trust/learn.py``).
 """
 
@@ -39,7 +39,7 @@ class Verdict(IntEnum):
     """None of these."""
 
 
-_POWER = 4
+_POWER = 8
 
 
 class Head(NamedTuple):
