@@ -63,7 +63,7 @@ def main() -> None:
     folder = report.output_folder(args.out)
     with stage("making a building and a drive"):
         scene = make(folder, args.seed)
-    words = localize.Args(scene.map, scene.log, folder, scene.reference, runs=args.runs, segments=1,
+    words = localize.Args(scene.map, scene.log, folder, reference=scene.reference, runs=args.runs, segments=1,
                           steps_per_segment=0, laser_max_range=LIDAR.range_max, seed=args.seed)  # fmt: skip
     localize.check(words)
     summary = localize.answer(words, scene.carried)
