@@ -64,7 +64,8 @@ def main() -> None:
     with stage("making a building and a drive"):
         scene = make(folder, args.seed)
     words = localize.Args(scene.map, scene.log, folder, reference=scene.reference, runs=args.runs, segments=1,
-                          steps_per_segment=0, laser_max_range=LIDAR.range_max, seed=args.seed)  # fmt: skip
+                          steps_per_segment=0, laser_max_range=LIDAR.range_max, seed=args.seed,
+                          json=args.json)  # fmt: skip
     localize.check(words)
     summary = localize.answer(words, scene.carried)
     if args.json:
