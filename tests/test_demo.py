@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import tiny_world
-from dsom_jax import cli, demo, localize
+from dsom_jax import cache, cli, demo, localize
 from dsom_jax.data import RawLog, load_bag
 from dsom_jax.data.bag_writer import odometry_at_rate, write_bag
 from dsom_jax.errors import run_cli
@@ -79,20 +79,20 @@ def test_demo(small, tmp_path, monkeypatch, capsys):
 
 def test_where_compiled_things_are_kept(tmp_path, monkeypatch):
     told = {}
-    monkeypatch.setattr(cli.jax.config, "update", told.__setitem__)
+    monkeypatch.setattr(cache.jax.config, "update", told.__setitem__)
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "elsewhere")
-    cli.keep_compiled()
+    cache.keep_compiled()
     assert not told
     monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(cli.sys, "platform", "linux")
-    cli.keep_compiled()
+    monkeypatch.setattr(cache.sys, "platform", "linux")
+    cache.keep_compiled()
     assert told["jax_compilation_cache_dir"] == str(tmp_path / "dsom_jax" / "jax") and (tmp_path / "dsom_jax").is_dir()
     # A place that cannot be written to is none.
     told.clear()
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    cli.keep_compiled()
+    cache.keep_compiled()
     assert not told
 
 

@@ -18,7 +18,8 @@ LAYERS = (
     ("proposals",),
     ("belief",),
     ("filters", "training", "montecarlo", "ambiguity"),
-    ("atomic", "data", "checkpoint", "run_folder", "trained", "plotting", "report", "judging", "view", "maps", "logs"),
+    ("atomic", "cache", "data", "checkpoint", "run_folder", "trained", "plotting", "report", "judging", "view", "maps",
+     "logs"),
     ("live",),
     (
         "__main__",

@@ -146,6 +146,16 @@ def test_kidnapping(call, tmp_path):
     assert len(stamps) == 20 and (np.diff(stamps) > 0).all()
 
 
+def test_live_gives_the_numbers_of_run_0_and_latencies(call, tmp_path):
+    call("--runs", "1", out="batch")
+    summary, printed = call("--live", out="live")
+    for name in ("estimate.tum", "answers.csv"):
+        assert (tmp_path / "live" / name).read_bytes() == (tmp_path / "batch" / name).read_bytes()
+    assert summary["runs"] == 1 and summary["updates"] == 40 and summary["converged"] == 1
+    latency = summary["latency_ms"]
+    assert 0 < latency["median"] <= latency["p99"] <= latency["max"] <= latency["first"] and "latency median" in printed
+
+
 def test_the_filter_of_the_paper(call):
     summary, _ = call("--method", "adam", "--t-cut", "0.7")
     assert summary["method"] == "adam" and summary["experiments"] == 8

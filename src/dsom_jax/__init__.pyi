@@ -8,6 +8,7 @@ from .errors import UserError
 from .filters.methods import DRAWN, METHODS, REAL, Settings, build_filter, make_filter, make_proposal
 from .judging.metrics import measure, pose_error, summarize
 from .lidar import LidarConfig
+from .live import Answer, Hypothesis, Localizer
 from .montecarlo import run, run_keys
 from .motion import OdometryMotion, OmniMotion
 from .occupancy import OccupancyGrid, from_cells
@@ -19,13 +20,16 @@ __all__ = [
     "DRAWN",
     "METHODS",
     "REAL",
+    "Answer",
     "BeamModel",
     "DriveConfig",
     "Episode",
     "Filter",
+    "Hypothesis",
     "Inputs",
     "LidarConfig",
     "LikelihoodField",
+    "Localizer",
     "Motion",
     "OccupancyGrid",
     "OdometryMotion",

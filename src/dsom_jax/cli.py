@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import io
-import os
 import re
-import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, redirect_stderr, suppress
-from pathlib import Path
+from contextlib import contextmanager, redirect_stderr
 from typing import TypeVar
 
-import jax
 import tyro
 from rich.progress import (
     BarColumn,
@@ -24,6 +20,7 @@ from rich.progress import (
 )  # fmt: skip
 
 from dsom_jax import report
+from dsom_jax.cache import keep_compiled
 from dsom_jax.errors import UserError
 
 T = TypeVar("T")
@@ -56,24 +53,6 @@ def one_line(box: str) -> str:
     sections = [part for part in re.split(r"[─-]{3,}", " ".join(row for row in rows if row)) if part.strip()] or [""]
     told = [sections[0], *(part for part in sections[1:2] if part.lstrip().startswith("Perhaps"))]
     return "; ".join(part.strip().rstrip(".:") for part in told)
-
-
-def keep_compiled() -> None:
-    """Let JAX keep what it compiles in the user's cache folder, unless the environment names another or forbids it."""
-    if "JAX_COMPILATION_CACHE_DIR" in os.environ:
-        return
-    folder = cache_folder() / "jax"
-    with suppress(OSError):  # without a place to write to, everything works, and is compiled every time
-        folder.mkdir(parents=True, exist_ok=True)
-        jax.config.update("jax_compilation_cache_dir", str(folder))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
-
-
-def cache_folder() -> Path:
-    """Where programs of this user keep what they can make again."""
-    if sys.platform == "darwin":
-        return Path.home() / "Library" / "Caches" / "dsom_jax"
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "dsom_jax"
 
 
 @contextmanager

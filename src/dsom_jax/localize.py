@@ -50,8 +50,10 @@ from dsom_jax.judging.scores import (
     verdicts,
 )  # fmt: skip
 from dsom_jax.lidar import LidarConfig
-from dsom_jax.montecarlo import run, run_keys
+from dsom_jax.live import Localizer
+from dsom_jax.montecarlo import Result, run, run_keys
 from dsom_jax.occupancy import OccupancyGrid
+from dsom_jax.types import Key
 from dsom_jax.view.localized import write_view
 
 
@@ -101,6 +103,8 @@ class Args:
     """Drive of the robot: `omni` also moves sideways (nav2's robot_model_type)."""
     memory: bool = True
     """Let adam_robust remember earlier scans on the likelihood grid; --no-memory judges every scan on its own."""
+    live: bool = False
+    """One run of each segment through a Localizer, update by update as on a robot; tells latencies."""
     kidnap: bool = False
     """Join each segment to the one half the log away, as an unnoticed kidnapping."""
     t_cut: float = 0.6
@@ -134,6 +138,8 @@ def answer(args: Args, carried: Sequence[float] = ()) -> dict[str, Any]:
 
     ``carried`` are stamps at which the robot is known to have been carried away, which no log tells.
     """
+    if args.live:
+        args = replace(args, runs=1)
     left_out = Report()
     grid = load_map(args.map, left_out)
     log = load_log(args.log, args.reading, reference=args.reference)
@@ -148,8 +154,12 @@ def answer(args: Args, carried: Sequence[float] = ()) -> dict[str, Any]:
     folder = report.output_folder(args.out)
     with stage("expected ranges from every place of the map"):
         filter = jax.block_until_ready(build(args, grid, log.lidar, network))
-    outcomes = localize(filter, each(drives, "segments"), args.runs, args.seed)
+    tracked = each(drives, "segments")
+    robot = Live(filter, grid, log.lidar) if args.live else None
+    outcomes = robot.localize(tracked, args.seed) if robot else localize(filter, tracked, args.runs, args.seed)
     summary = summary_of(outcomes, grid, args, on_plan, others)
+    if robot:
+        summary["latency_ms"] = robot.latency_ms()
     given = [replies(outcome.result.info, judged_by(args.method)) for outcome in outcomes]
     found = reference_notes(summary, reference_shift(drives, given))
     tell(found, args)
@@ -293,6 +303,39 @@ def localize(filter: Watched, drives: Any, runs: int, seed: int) -> list[Outcome
     return outcomes
 
 
+class Live:
+    """One robot that drives the segments one after another."""
+
+    def __init__(self, filter: Watched, grid: OccupancyGrid, lidar: LidarConfig) -> None:
+        self._begun = time.perf_counter()
+        self._robot = Localizer(grid, lidar, filter=filter)
+        self._first, self._seconds = 0.0, list[float]()
+
+    def localize(self, drives: Any, seed: int) -> list[Outcome]:
+        """Every drive once, with the luck of run 0."""
+        return [self._drive(drive, run_keys(seed, number, 1)) for number, drive in enumerate(drives)]
+
+    def _drive(self, drive: Drive, keys: Key) -> Outcome:
+        infos, states, seconds = [], [], []
+        self._robot.relocalize(keys)
+        ranges, odometry = np.asarray(drive.episode.ranges), np.asarray(drive.episode.odometry)
+        for scan, motion, stamp in zip(ranges, odometry, drive.stamps, strict=True):
+            seconds.append(self._robot.advance(scan, motion, float(stamp)).seconds)
+            self._first = self._first or time.perf_counter() - self._begun
+            infos.append(self._robot.info)
+            states.append(self._robot.state())
+        info, kept = (jax.tree.map(lambda *leaves: np.stack(leaves), *rows) for rows in (infos, states))
+        self._seconds += seconds
+        last = jax.tree.map(lambda leaf: leaf[None], states[-1])
+        return Outcome(drive, Result(jax.tree.map(lambda leaf: leaf[None], info), last, kept), sum(seconds))
+
+    def latency_ms(self) -> dict[str, float]:
+        """Milliseconds of the updates; ``first`` is from making the Localizer to its first answer."""
+        ms = 1e3 * np.array(self._seconds)
+        summary = {"median": np.median(ms), "p99": np.percentile(ms, 99), "max": ms.max(), "first": 1e3 * self._first}
+        return {name: float(value) for name, value in summary.items()}
+
+
 def carried_over(drives: list[Drive], reference: Path | None) -> list[Drive] | None:
     """The drives with another reference, if there is one."""
     if reference is None:
@@ -377,6 +420,9 @@ def print_summary(summary: dict[str, Any], folder: Path) -> None:
         sure = f"{summary['updates']} updates, sure of the answer in {summary['certain']:.1%} of them"
         console.print(f"{sure}; no reference to judge by")
     console.print(f"{summary['ms_per_update']:.1f} ms per update of all {summary['runs']} runs", style="dim")
+    if latency := summary.get("latency_ms"):
+        times = ", ".join(f"{name} {value:.1f} ms" for name, value in latency.items())
+        console.print(f"latency {times}", style="dim")
     console.print(f"look at {folder / 'report.html'}{worst(summary)}", soft_wrap=True, highlight=False)
 
 

@@ -175,6 +175,10 @@ class GridBelief:
         focus = jnp.zeros((self.config.rows, headings))
         return Memory(self._even(), rows, focus, jnp.bool_(False), jnp.float32(0.0), pool, scan, jnp.zeros(3))
 
+    def around(self, pose: Array, covariance: Array) -> Memory:
+        """Belief that is Gaussian about a base pose (3,); no narrower than a cell."""
+        return self.begin()._replace(mass=self.likelihood.around(pose, covariance))
+
     @property
     def _shape(self) -> tuple[int, int]:
         return self.likelihood.cells.size, self.likelihood.config.headings

@@ -91,6 +91,17 @@ class Watched:
         """Nothing known."""
         return WatchedState(self.filter.init(key), self.monitor.start(), jnp.int8(Verdict.LOST))
 
+    def around(self, key: Key, pose: Array, covariance: Array) -> tuple[Any, WatchedState, Array]:
+        """Memory and state after a start from a pose (3,) with a covariance (3, 3), and the share of it that is free.
+
+        TypeError where the filter cannot.
+        """
+        if not hasattr(self.filter, "around"):
+            raise TypeError(f"{type(self.filter).__name__} cannot start from a pose; use AdaM robust")
+        own, state, free = self.filter.around(key, pose, covariance)
+        memory = own, () if self.drawn else self.belief.around(pose, covariance)
+        return memory, WatchedState(state, self.monitor.start(), jnp.int8(Verdict.LOCALIZED)), free
+
     def step(self, key: Key, state: WatchedState, inputs: Inputs, prepared: Shared) -> tuple[WatchedState, WatchedInfo]:
         """One update of the filter, and what to make of it."""
         own, info = self.filter.step(key, state.state, inputs, prepared.prepared)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,15 +19,21 @@ def thin(log: RawLog, update_min_d: float = 0.25, update_min_a: float = 0.2) -> 
     moved ``update_min_d`` metres or turned ``update_min_a`` radians since the last used scan, or jumped."""
     if update_min_d < 0 or update_min_a < 0:
         raise UserError(f"update_min_d = {update_min_d}, update_min_a = {update_min_a}: must not be negative")
-    x, y, theta = log.odometry.T.tolist()
+    poses = log.odometry.tolist()
     broken = np.zeros(len(log), bool) if log.broken is None else log.broken
     used = [0] if len(log) else []
     for n in range(1, len(log)):
-        k = used[-1]
-        turned = abs((theta[n] - theta[k] + np.pi) % (2 * np.pi) - np.pi)
-        if math.hypot(x[n] - x[k], y[n] - y[k]) >= update_min_d or turned >= update_min_a or broken[n]:
+        if far_enough(poses[used[-1]], poses[n], update_min_d, update_min_a) or broken[n]:
             used.append(n)
     return np.array(used, int)
+
+
+def far_enough(
+    a: Sequence[float] | np.ndarray, b: Sequence[float] | np.ndarray, update_min_d: float, update_min_a: float
+) -> bool:
+    """Whether odometry that went from pose ``a`` (3,) to ``b`` has moved or turned enough for an update."""
+    turned = abs((b[2] - a[2] + np.pi) % (2 * np.pi) - np.pi)
+    return bool(math.hypot(b[0] - a[0], b[1] - a[1]) >= update_min_d or turned >= update_min_a)
 
 
 def to_episode(log: RawLog, indices: np.ndarray) -> Episode:

@@ -12,6 +12,7 @@ Particles refine what the grid is too coarse for; the grid carries the places th
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -48,6 +49,10 @@ class AdamMemory(AdamRobust):
     def _share(self, state: RobustState) -> Array:
         """a ()."""
         return jnp.clip(state.lost, *self.share)
+
+    def _memory_around(self, pose: Array, covariance: Array) -> Any:
+        """The belief of the grid."""
+        return self.proposal.around(pose, covariance)
 
     def _log_kept(self, state: RobustState) -> Array:
         """log(1 - a)."""

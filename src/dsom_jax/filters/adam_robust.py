@@ -22,6 +22,7 @@ from jax.scipy.special import logsumexp
 from dsom_jax import checks
 from dsom_jax.filters.common import Info, describe
 from dsom_jax.filters.world import World
+from dsom_jax.geometry import wrap_angle
 from dsom_jax.occupancy import is_free
 from dsom_jax.resampling import pick
 from dsom_jax.types import Array, Inputs, Key, Proposal
@@ -108,6 +109,24 @@ class AdamRobust:
         n = self.config.particles
         poses, _ = self.world.space.sample(key, None, n)
         return RobustState(poses, jnp.full((n,), -math.log(n), jnp.float32), jnp.float32(1.0), jnp.int32(0))
+
+    def around(self, key: Key, pose: Array, covariance: Array) -> tuple[Any, RobustState, Array]:
+        """Memory and state after a start from a pose (3,) with a covariance (3, 3), and the share of it that is free.
+
+        The next update moves and weighs these particles; it does not draw them anew.
+        """
+        n = self.config.particles
+        root = jnp.linalg.cholesky(covariance + 1e-6 * jnp.eye(3))
+        poses = pose + jax.random.normal(key, (n, 3)) @ root.T
+        poses = poses.at[:, 2].set(wrap_angle(poses[:, 2]))
+        free = is_free(self.world.grid, poses)
+        log_weights = jnp.where(free, 0.0, -jnp.inf) - jnp.log(jnp.maximum(free.sum(), 1))
+        state = RobustState(poses, log_weights, jnp.float32(0.0), jnp.int32(1))
+        return self._memory_around(pose, covariance), state, free.mean()
+
+    def _memory_around(self, pose: Array, covariance: Array) -> Any:
+        """The proposal's memory, if it has one, after a start from a pose."""
+        return self.proposal.begin()
 
     def step(self, key: Key, state: RobustState, inputs: Inputs, prepared: Any) -> tuple[RobustState, Info]:
         """One update."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from dsom_jax import checks
 from dsom_jax import pose_grid as pg
-from dsom_jax.geometry import compose
+from dsom_jax.geometry import compose, wrap_angle
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.occupancy import OccupancyGrid, pad
 from dsom_jax.raycast import MapTables, RaycastConfig, cast_rays, make_tables
@@ -113,6 +113,21 @@ class LikelihoodGrid:
         poses = pg.cell_pose(self.map_cells, i + along - 0.5, j + u[3] - 0.5, k + u[4] - 0.5)
         x, y, _ = self.lidar.mount
         return compose(poses, jnp.array([-x, -y, 0.0])), self._log_density(prepared, cell, k)
+
+    def around(self, pose: Array, covariance: Array) -> Array:
+        """(C, K) mass of sum one at the free cells, Gaussian about a base pose (3,); no narrower than a cell."""
+        grid, (x, y, _) = self.pose_grid, self.lidar.mount
+        i, j = jnp.divmod(self.cells, grid.width)
+        cells = pg.cell_pose(grid, *jnp.broadcast_arrays(i[:, None], j[:, None], jnp.arange(grid.headings)))
+        # Cells are those of the sensor.
+        off = cells - compose(pose, jnp.array([x, y, 0.0]))
+        off = off.at[..., 2].set(wrap_angle(off[..., 2]))
+        floor = jnp.array([grid.resolution, grid.resolution, grid.turn]) ** 2 / 4
+        precision = jnp.linalg.inv(covariance + jnp.diag(floor))
+        real = (self.cells < self.free.size)[:, None]
+        log_mass = jnp.where(real, -0.5 * jnp.einsum("cka,ab,ckb->ck", off, precision, off), -jnp.inf)
+        mass = pg.exp_or_zero(log_mass - log_mass.max())
+        return mass / mass.sum()
 
     def log_density(self, prepared: pg.ProbabilityMap, poses: Array) -> Array:
         """Log density (...) of :meth:`sample` at base poses (..., 3) in 1 / (m^2 rad); -inf off free space."""

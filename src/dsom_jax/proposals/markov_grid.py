@@ -81,6 +81,10 @@ class MarkovGrid:
         maps = (self.likelihood.probability_map(v) for v in (log_prior, log_posterior))
         return Recollection(*maps), normalised(posterior)
 
+    def around(self, pose: Array, covariance: Array) -> Array:
+        """Belief (C, K) that is Gaussian about a base pose (3,); no narrower than a cell."""
+        return self.likelihood.around(pose, covariance)
+
     def evidence(self, inputs: Inputs) -> Array:
         """(C, K) what one scan says: the tempered log-likelihood."""
         return self.likelihood.log_likelihood(inputs.ranges)
