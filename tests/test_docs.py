@@ -31,8 +31,8 @@ PAPER = (ROOT / "docs" / "paper_to_code.md").read_text()
 LINK = re.compile(r"\[([^\]]*)\]\(([^)#\s]+)\)")
 COMMAND = re.compile(r"python -m dsom_jax\.(\w+) ([^`\n]*)")
 ARGUMENTS = {"bench": "Args", "localize": "Args", "demo": "Args", "certify": "Args", "train": "Arguments",
-             "train_filter": "Arguments", "evaluate": "Args", "export": "Args"}  # fmt: skip
-FOREIGN = {"--clock", "--rate", "--ros-args", "--save"}
+             "train_filter": "Arguments", "evaluate": "Args", "export": "Args", "ros2": "Args"}  # fmt: skip
+FOREIGN = {"--clock", "--rate", "--ros-args", "--save", "--system-site-packages"}
 """Options of other programs' commands on the pages: ros2, evo."""
 
 
@@ -49,7 +49,8 @@ def blocks(page: Path) -> list[str]:
 
 def arguments(module: str) -> type:
     """The dataclass of a command line."""
-    return getattr(import_module(f"dsom_jax.{module}"), ARGUMENTS[module])
+    home = {"ros2": "ros2.__main__"}.get(module, module)
+    return getattr(import_module(f"dsom_jax.{home}"), ARGUMENTS[module])
 
 
 def write_map_and_log(folder: Path) -> None:
@@ -70,6 +71,7 @@ def write_map_and_log(folder: Path) -> None:
 CLOSER = {
     "README.md": "assert np.median(np.hypot(*(result.info.cluster[:, -1] - log.odometry[-2])[:, :2].T)) < 0.5",
     "quickstart.md": "",
+    "ros2.md": "assert answer.localized and np.hypot(*(answer.pose - log.odometry[-1])[:2]) < 0.5",
 }
 """What is asserted after the last block of a page: of 13 scans, two segments use the first 12."""
 
