@@ -31,7 +31,8 @@ PAPER = (ROOT / "docs" / "paper_to_code.md").read_text()
 LINK = re.compile(r"\[([^\]]*)\]\(([^)#\s]+)\)")
 COMMAND = re.compile(r"python -m dsom_jax\.(\w+) ([^`\n]*)")
 ARGUMENTS = {"bench": "Args", "localize": "Args", "demo": "Args", "certify": "Args", "train": "Arguments",
-             "train_filter": "Arguments", "evaluate": "Args", "export": "Args", "ros2": "Args"}  # fmt: skip
+             "train_filter": "Arguments", "evaluate": "Args", "export": "Args", "ros2": "Args",
+             "inspect": "Args"}  # fmt: skip
 FOREIGN = {"--clock", "--rate", "--ros-args", "--save", "--system-site-packages"}
 """Options of other programs' commands on the pages: ros2, evo."""
 

@@ -19,7 +19,7 @@ LAYERS = (
     ("belief",),
     ("filters", "training", "montecarlo", "ambiguity"),
     ("atomic", "cache", "data", "checkpoint", "run_folder", "trained", "plotting", "report", "judging", "view", "maps",
-     "logs"),
+     "logs", "diagnosis"),
     ("live",),
     (
         "__main__",
@@ -29,6 +29,7 @@ LAYERS = (
         "train_filter",
         "bench",
         "localize",
+        "inspect",
         "demo",
         "certify",
         "evaluate",

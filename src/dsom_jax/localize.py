@@ -7,7 +7,7 @@ import math
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -24,6 +24,7 @@ from dsom_jax.cli import each, parse, stage
 from dsom_jax.data import LogOptions, RawLog, Report, load_log, load_map
 from dsom_jax.data.cut import segment_indices, splice, to_episode, without_repeats
 from dsom_jax.data.log import STILL, limited
+from dsom_jax.diagnosis.symptoms import cheap_findings
 from dsom_jax.errors import UserError, one_line, run_cli
 from dsom_jax.filters.methods import (
     DRAWN,
@@ -143,9 +144,11 @@ def answer(args: Args, carried: Sequence[float] = ()) -> dict[str, Any]:
     left_out = Report()
     grid = load_map(args.map, left_out)
     log = load_log(args.log, args.reading, reference=args.reference)
+    findings = cheap_findings(log, grid)
     log = limited(log, args.laser_max_range)
     reports = ((args.map, left_out), (args.log, log.report))
     notes = [f"{file.name}: {line}" for file, report_of in reports for line in report_of.lines()]
+    notes += [finding.line() for finding in findings]
     tell(notes, args)
     drives = [marked(drive, carried) for drive in cut(log, args)]
     others = {name: replies_of(path, drives) for name, path in named(args.external, "FILE.tum").items()}
@@ -165,6 +168,7 @@ def answer(args: Args, carried: Sequence[float] = ()) -> dict[str, Any]:
     tell(found, args)
     notes += found
     summary["notes"] = notes
+    summary |= {"findings": [asdict(finding) for finding in findings]}
     with stage("writing the page"):
         report.write_json(folder / "summary.json", summary)
         save_estimate(folder / "estimate.tum", outcomes)
