@@ -88,7 +88,7 @@ def test_a_jump_is_no_step():
     )
     away = compose(episode.poses[1], jnp.array([3.0, 0.0, 0.0]))
     track, signs = watcher.watch(track, away, episode.ranges[1], episode.odometry[1], jnp.bool_(False), zero, zero)
-    assert float(signs.jump) == 1.0 and float(track.count) == 0.0 and float(track.squared) == 0.0
+    assert float(signs.jump) == 1.0 and float(track.steps) == 0.0 and float(track.squared) == 0.0
 
 
 @given(

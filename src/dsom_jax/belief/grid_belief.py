@@ -209,7 +209,7 @@ class GridBelief:
         some = jax.tree.map(lambda v: v[::stride], judged.pool)
         poses, _, _ = self._poses(some, (jnp.arange(some.cell.size)[:, None] * _EVEN) % 1.0)
         places = Places(judged.pool, poses, judged.off, jnp.where(counts, fresh, 0.0))
-        return places, Memory(*judged, scan, pending)
+        return places, Memory(**judged._asdict(), scan=scan, pending=pending)
 
     def _held(self, memory: Memory, rows: Array, odometry: Array, ranges: Array, fresh: Array) -> _Judged:
         """Nothing new: the belief as it was."""
@@ -374,8 +374,8 @@ class GridBelief:
         within = jnp.cumsum(posterior[row], -1)
         k = pick_in_rows(within, jnp.arange(n), (jnp.arange(n) * _EVEN[0]) % 1.0)
         cell = cells[row]
-        volume = self.likelihood.map_cells.log_cell_volume
-        volume = volume + jnp.log(self.likelihood.parts.at[cell, -1].get(mode="clip").astype(jnp.float32))
+        parts = self.likelihood.parts.at[cell, -1].get(mode="clip").astype(jnp.float32)
+        volume = self.likelihood.map_cells.log_cell_volume + jnp.log(parts)
         log_prior = jnp.log(prior[row, k] / prior.sum()) - volume
         return Pool(cell, k, log_prior, jnp.log(posterior[row, k] / by_row.sum()) - volume)
 

@@ -71,7 +71,7 @@ class Track(NamedTuple):
             a step that was answered backwards counts as one forth, as some encoders do not tell the two apart.
         back, path: () metres answered backwards, and all, in the last minutes.
         slide, turn: () faded sums of squared gaps between reported and answered steps (m^2) and turns (rad^2).
-        count: () faded number of steps.
+        steps: () faded number of steps.
         jump: () faded number of steps that no odometry explains.
     """
 
@@ -85,7 +85,7 @@ class Track(NamedTuple):
     path: Array
     slide: Array
     turn: Array
-    count: Array
+    steps: Array
     jump: Array
 
 
@@ -195,14 +195,14 @@ class Monitor:
             path=long * track.path + use * travel,
             slide=keep * track.slide + use * jnp.where(use > 0, off, 0.0) ** 2,
             turn=keep * track.turn + use * gap**2,
-            count=keep * track.count + use,
+            steps=keep * track.steps + use,
             jump=jnp.where(first, 0.0, 0.8 * track.jump) + jnp.where(first, 0.0, jumped),
         )
 
     def _signs(self, track: Track, now: Fit, elsewhere: Array, scattered: Array) -> Signs:
         hit, short, long, unknown, known = track.fit / track.weight
         total = jnp.maximum(hit + short + long, 1e-6)
-        steps = track.squared / jnp.maximum(track.count, 1e-6)
+        length = track.squared / jnp.maximum(track.steps, 1e-6)
         sure = track.squared / (track.squared + 0.1)
         crab = jnp.arctan2(jnp.abs(track.cross), track.along)
         ratio = track.along / jnp.maximum(track.squared, 1e-6)
@@ -218,10 +218,10 @@ class Monitor:
             crab=sure * crab,
             backward=track.path / (track.path + 0.3) * track.back / jnp.maximum(track.path, 1e-6),
             stretch=sure * jnp.abs(ratio - 1),
-            slide=sure * jnp.sqrt(track.slide / jnp.maximum(track.count, 1e-6) / (steps + 0.01)),
-            turn=jnp.sqrt(track.turn / jnp.maximum(track.count, 1.0)),
+            slide=sure * jnp.sqrt(track.slide / jnp.maximum(track.steps, 1e-6) / (length + 0.01)),
+            turn=jnp.sqrt(track.turn / jnp.maximum(track.steps, 1.0)),
             jump=track.jump,
-            fresh=jnp.exp(-track.count),
+            fresh=jnp.exp(-track.steps),
         )
 
 

@@ -113,5 +113,7 @@ class Watched:
         wrong = p_lost(signs, self.head)
         on_map = is_free(self.monitor.tables.grid, answer)
         verdict = judge(state.verdict, wrong, places.off, on_map, signs.unknown, prepared.hypotheses)
-        told = WatchedInfo(*info, wrong, verdict, places.off, prepared.hypotheses, signs)
+        own_words = info._asdict()
+        told = WatchedInfo(**own_words, p_lost=wrong, verdict=verdict, off_map=places.off,
+                           hypotheses=prepared.hypotheses, signs=signs)  # fmt: skip
         return WatchedState(own, track, verdict), told

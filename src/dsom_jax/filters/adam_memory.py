@@ -84,10 +84,10 @@ class AdamPlaces(AdamMemory):
         stands = is_free(self.world.grid, poses)
         return Draw(poses, share + jnp.where(stands, log_prior - log_q, -jnp.inf) - jnp.log(low.sum()))
 
-    def _worth(self, state: RobustState, prepared: Places) -> Array:  # type: ignore[override]
+    def _worth(self, state: RobustState, prepared: Places) -> Array:
         """Less while lost, and less of a scan that is not new; a little, so that particles stay where it holds them."""
         return super()._worth(state, prepared) * jnp.maximum(prepared.novelty, _LEAST)
 
-    def _doubted(self, info: Info, prepared: Places) -> Info:  # type: ignore[override]
+    def _doubted(self, info: Info, prepared: Places) -> Info:
         """The place is lost if the belief is elsewhere, whichever of two equal clusters has survived."""
         return info._replace(lost=jnp.maximum(info.lost, 1.0 - share_at(prepared.poses, info.cluster)))
