@@ -33,7 +33,7 @@ LOGS = {
 """Name -> folders of the map and of the log. The floor plan ``walls-only`` has no log of its own."""
 DRAWN = ("walls-only",)
 """Maps that are floor plans."""
-METHODS = ("adam_robust", "adam")
+METHODS = ("adam_robust", "adam_sharp")
 ON_MAP = 0.85
 """A segment lies on mapped space if this share of its reference poses is on free cells."""
 COLUMNS = ("log", "method", "runs", "converged %", "steps", "retention %", "strict %", "median error m",

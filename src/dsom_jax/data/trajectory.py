@@ -29,8 +29,10 @@ class Trajectory:
 
 def yaw_of(quaternion: np.ndarray) -> np.ndarray:
     """Heading (...) of quaternions (..., 4) = (x, y, z, w), radians; roll and pitch do not matter."""
-    x, y, z, w = np.moveaxis(np.asarray(quaternion, float), -1, 0)
-    # Written so that the quaternion need not be normalised.
+    quaternion = np.asarray(quaternion, float)
+    # Written so that the quaternion need not be normalised, only small enough for its squares to be numbers.
+    largest = np.abs(quaternion).max(-1, keepdims=True)
+    x, y, z, w = np.moveaxis(quaternion / np.where((largest > 0) & np.isfinite(largest), largest, 1.0), -1, 0)
     return np.arctan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)
 
 
