@@ -14,10 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dsom_jax import bench, checkpoint, report
+from dsom_jax import bench, checkpoint
 from dsom_jax.episode import Episode
 from dsom_jax.errors import UserError, run_cli
-from dsom_jax.judging.run_table import paired
+from dsom_jax.judging.run_table import paired, read_runs
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.occupancy import from_cells
 
@@ -165,7 +165,7 @@ def test_per_run_values_are_those_of_the_table(suite, monkeypatch, tmp_path):
     methods = "mcl,adam_likelihood_grid,robust_likelihood_grid"
     command(monkeypatch, "--methods", methods, "--out", str(tmp_path), "--per-run")
     data = json.loads((tmp_path / "bench.json").read_text())["methods"]
-    table = report.read_runs(tmp_path / "runs.npz")
+    table = read_runs(tmp_path / "runs.npz")
     # 3 methods x 2 phases x 3 sequences x 4 runs.
     assert len(table.run) == 72 and (table.part == 0).all()
     for method in methods.split(","):
