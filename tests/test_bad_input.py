@@ -110,7 +110,7 @@ FILES = {
     "all NaN": (lambda d: write_log(d, np.full(SHAPE, np.nan)), ["drive.log", "NaN"]),
     "all zero": (lambda d: write_log(d, np.zeros(SHAPE)), ["drive.log", "zero"]),
     "beyond the limit": (lambda d: write_log(d, np.full(SHAPE, 60.0)), ["drive.log", "5 m", "range_max"]),
-    "standing still": (lambda d: stand_still(d), ["drive.log", "1 updates", "--update-min-d"]),
+    "standing still": (lambda d: stand_still(d), ["drive.log", "never moves", "--odom-topic"]),
 }
 
 

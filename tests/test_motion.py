@@ -145,7 +145,7 @@ def test_densities_broadcast_pairwise():
 
 
 def test_bad_parameters_are_refused():
-    with pytest.raises(ValueError, match=r"OdometryMotion\.alpha3 = -0\.1: must not be negative"):
+    with pytest.raises(ValueError, match=r"alpha3 = -0\.1: must not be negative"):
         OdometryMotion(alpha3=-0.1)
     assert hash(OdometryMotion()) == hash(OdometryMotion())
 

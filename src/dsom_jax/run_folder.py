@@ -255,9 +255,9 @@ def reopen(
     record = checkpoint.read_json(path, "restore it, or give another --out")
     run = kind(path.parent, None, *checked(record, path))
     run.config = read_config(record["config"])
-    run.hold()
     if maps and tuple(map(str, maps)) != run.maps:
         raise UserError(f"--maps: the run in {path} has {', '.join(run.maps) or 'none'}; resume without --maps")
+    run.hold()
     if steps is not None and run.total is not None and steps != run.total:
         raise UserError(f"--steps {steps}: the run in {path} has {run.total}; resume without --steps")
     run.total = run.total or steps
