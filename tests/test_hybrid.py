@@ -126,7 +126,7 @@ def test_a_mounted_lidar_still_gives_poses_of_the_base(parts):
 
 @pytest.mark.parametrize("change", [{"evidence": -1.0}, {"network": -0.1}, {"floor": 0.0}, {"floor": 1.0}])
 def test_weights_that_mean_nothing_are_refused(change):
-    with pytest.raises(ValueError, match="HybridConfig"):
+    with pytest.raises(ValueError, match=next(iter(change))):
         HybridConfig(**change)
 
 

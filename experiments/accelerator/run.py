@@ -183,7 +183,7 @@ def building(size: tuple[float, float], cell: float) -> OccupancyGrid:
         whole = np.block([parts[row * cols : (row + 1) * cols] for row in range(rows)])
         return whole[: round(size[1] / cell), : round(size[0] / cell)]
 
-    return from_cells(joined("occupied"), joined("free"), resolution=cell)
+    return from_cells(jnp.asarray(joined("occupied")), jnp.asarray(joined("free")), resolution=cell)
 
 
 def grid_times(sizes: Sizes) -> dict[str, Any]:
@@ -289,11 +289,12 @@ class Training:
         model = averaged_model(self.config, self.state)
         scores = self.evaluate(model)
         samples = self.done * self.config.early.worlds * self.config.early.scans
-        facts = {"seed": self.config.seed, "init": self.args.init and self.args.init.name, "steps": self.done}
+        init = self.args.init and self.args.init.name
+        facts: dict[str, Any] = {"seed": self.config.seed, "init": init, "steps": self.done}
         facts |= {"samples": samples, "seconds": round(self.record.spent(), 1), "metrics": scores}
         data = {"data": "procedural buildings, dsom_jax.simulate.make_world", "train": asdict(self.config)}
         folder = self.record.path.with_name("dsom-paper")
-        checkpoint.save(folder, model, facts | data, f"weights-{self.done:08d}", half=True)
+        checkpoint.save(folder, model, facts | data, tag=f"weights-{self.done:08d}", half=True)
         checkpoint.write_json(folder.parent / "curve.json", self.curve)
         self.record.note("network", f"{phase}, step {self.done}", {"samples": samples, **scores})
 

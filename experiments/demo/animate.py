@@ -44,7 +44,7 @@ def photographs(page: Path) -> list[Image.Image]:
     try:
         driver.get(page.as_uri())
         stage, slider = driver.find_element("id", "player"), driver.find_element("id", "slider")
-        updates = int(slider.get_attribute("max")) + 1
+        updates = int(slider.get_attribute("max") or 0) + 1
         driver.execute_script("document.querySelector('.bar').scrollIntoView()")
         return [photograph(driver, stage, t) for t in range(updates)]
     finally:

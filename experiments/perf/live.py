@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import tyro
 from timing import machine, save
@@ -41,12 +42,12 @@ MEGABYTE = 1024.0
 def building(metres: float) -> OccupancyGrid:
     """Blocks side by side, all different; the robot's is the one at the origin."""
     side = max(1, round(metres / BLOCK))
-    config = dj.WorldConfig(cells=round(metres / side / RESOLUTION), resolution=RESOLUTION)
-    make = jax.jit(dj.make_world, static_argnums=1)
+    config = dj.simulate.WorldConfig(cells=round(metres / side / RESOLUTION), resolution=RESOLUTION)
+    make = jax.jit(dj.simulate.make_world, static_argnums=1)
     rows = [[make(jax.random.key(side * i + j), config) for j in range(side)] for i in range(side)]
     occupied, free = (np.block([[np.asarray(getattr(g, part)) for g in row] for row in rows])
                       for part in ("occupied", "free"))  # fmt: skip
-    return dj.OccupancyGrid(occupied, free, rows[0][0].origin, RESOLUTION)
+    return dj.from_cells(jnp.asarray(occupied), jnp.asarray(free), resolution=RESOLUTION)
 
 
 def drive(metres: float, updates: int) -> dj.Episode:
@@ -72,7 +73,7 @@ def one(metres: float, updates: int) -> None:
     """Print as JSON what one process took from the map to the first answer, and then for the drive."""
     saved = np.load(recording(metres))
     occupied, free, ranges, odometry, truth = (saved[n] for n in ("occupied", "free", "ranges", "odometry", "truth"))
-    grid = dj.OccupancyGrid(occupied, free, np.zeros(3, np.float32), RESOLUTION)
+    grid = dj.from_cells(jnp.asarray(occupied), jnp.asarray(free), resolution=RESOLUTION)
     before, begun, spent = peak(), time.perf_counter(), time.process_time()
     robot = dj.Localizer(grid, LIDAR)
     answers, wall, cpu = [], [], []
@@ -170,7 +171,7 @@ def soak(updates: int = 100_000, metres: float = 33.0, block: int = 1000) -> Non
     record(metres, 60)
     saved = np.load(recording(metres))
     ranges, odometry = saved["ranges"], saved["odometry"]
-    grid = dj.OccupancyGrid(saved["occupied"], saved["free"], np.zeros(3, np.float32), RESOLUTION)
+    grid = dj.from_cells(jnp.asarray(saved["occupied"]), jnp.asarray(saved["free"]), resolution=RESOLUTION)
     robot = dj.Localizer(grid, LIDAR)
     there = np.arange(len(ranges))
     order = np.concatenate([there, there[-2:0:-1]])

@@ -77,7 +77,7 @@ def judged(case: strangers.Case, truth: Path, folder: Path, args: Args) -> dict:
     outcomes = localize.localize(
         localize.build(settings, grid, log.lidar), localize.cut(log, settings), args.runs, settings.seed
     )
-    summary = json.loads(json.dumps(localize.summarize(outcomes, grid, settings)))
+    summary = json.loads(json.dumps(localize.summary_of(outcomes, grid, settings)))
     return {rate: summary[rate] for rate in (*RATES, "e_pos_m_median")} | {
         "scans": len(log),
         "notes": log.report.lines(),

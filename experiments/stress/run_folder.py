@@ -68,7 +68,7 @@ def work(out: Path, steps: int, pause: float, saved: int) -> None:
         plain(run, state, metrics)
         os.write(saved, b"%d\n" % int(state.step))
 
-    Run.save = save  # type: ignore[method-assign]
+    Run.save = save  # type: ignore[method-assign,assignment]
     args = Arguments(out=out, resume=True, steps=steps, save_steps=2)
     run, _ = open_run(args)
 

@@ -217,7 +217,7 @@ def measure(case: Case, runs: int) -> dict[str, Any]:
     filter = make_filter("adam_robust", proposal, case.grid, case.lidar, case.settings)
     filter = watch(filter, case.grid, case.lidar, case.settings)
     judged = [judge(case, n, run(filter, e, run_keys(0, n, runs)).info, e) for n, e in enumerate(case.episodes)]
-    pooled = {name: [j[name] for j in judged if j[name] is not None] for name in judged[0]}
+    pooled = {name: [part for j in judged if (part := j[name]) is not None] for name in judged[0]}
     return {name: round(float(np.mean(np.concatenate(v))), 4) if v else None for name, v in pooled.items()}
 
 

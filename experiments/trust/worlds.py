@@ -88,7 +88,7 @@ def twofold(grid: OccupancyGrid) -> OccupancyGrid:
     rows = len(occupied) // 2
     for cells in (occupied, free):
         cells[rows:] = cells[:rows][::-1, ::-1]
-    return from_cells(occupied, free, resolution=grid.resolution)
+    return from_cells(jnp.asarray(occupied), jnp.asarray(free), resolution=grid.resolution)
 
 
 def fourfold(grid: OccupancyGrid) -> OccupancyGrid:
@@ -102,7 +102,7 @@ def fourfold(grid: OccupancyGrid) -> OccupancyGrid:
             where = np.zeros_like(cells)
             where[:side, :side] = True
             cells[np.rot90(where, turns)] = np.rot90(corner, turns)[np.rot90(where, turns)]
-    return from_cells(occupied, free, resolution=grid.resolution)
+    return from_cells(jnp.asarray(occupied), jnp.asarray(free), resolution=grid.resolution)
 
 
 def half(rng: np.random.Generator, grid: OccupancyGrid) -> OccupancyGrid:
