@@ -96,5 +96,5 @@ def test_bag_of_a_pioneer() -> None:
 
 
 def test_no_return_is_found_without_help() -> None:
-    log = load_log(real_data("intel/log.clf.gz"), range_max=1e6)
+    log = load_log(real_data("intel/log.clf.gz"), range_max=1e4)
     assert detect_no_return(log.ranges) == pytest.approx(81.825, abs=1e-3)
