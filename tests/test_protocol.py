@@ -50,8 +50,8 @@ def test_every_method_gets_its_proposal_and_the_settings_of_the_map(monkeypatch)
     ):
         build(variant, "grid", "episode")
     assert [words[:2] for words in made] == [
-        ("mixture_mcl", ("dual_features", None)), ("mixture_mcl", ("dual_features", None, "episode")),
-        ("adam", ("dsom", ("dsom", Path("old")))), ("adam", ("dsom", ("dsom", Path("new")))),
+        ("mixture_mcl_sharp", ("dual_features", None)), ("mixture_mcl_sharp", ("dual_features", None, "episode")),
+        ("adam_sharp", ("dsom", ("dsom", Path("old")))), ("adam_sharp", ("dsom", ("dsom", Path("new")))),
     ]  # fmt: skip
     assert all((w[4].particles, w[4].robust) == (7, DRAWN.robust) for w in made)
     assert [w[4].t_cut for w in made[2:]] == [0.5, 0.4]
