@@ -103,7 +103,8 @@ def test_localize_holds_all_against_both_references(tmp_path):
     outcomes = []
     for d in drives:
         poses = np.asarray(d.episode.poses)[None]
-        info = SimpleNamespace(mean=poses, cluster=poses, lost=np.full((1, UPDATES), 0.01))
+        sure, localized = np.full((1, UPDATES), 0.01), np.zeros((1, UPDATES), np.int8)
+        info = SimpleNamespace(mean=poses, cluster=poses, lost=sure, p_lost=sure, verdict=localized)
         outcomes.append(Outcome(d, Result(info, None, None), 1.0))
     args = localize.Args(map=tmp_path, log=tmp_path, out=tmp_path)
     on_plan = localize.carried_over(drives, tmp_path / "plan.tum")

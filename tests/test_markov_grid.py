@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 import tiny_world
+from dsom_jax.belief.grid_belief import GridBeliefConfig
 from dsom_jax.filters.adam import AdamMCL
-from dsom_jax.filters.adam_memory import AdamMemory
+from dsom_jax.filters.adam_memory import AdamMemory, AdamPlaces
 from dsom_jax.filters.adam_robust import AdamRobust, RobustConfig, RobustState
-from dsom_jax.filters.methods import Settings, build_filter, make_filter
+from dsom_jax.filters.methods import Settings, build_filter, make_filter, remembering
 from dsom_jax.filters.world import World
 from dsom_jax.geometry import compose, inverse, wrap_angle
 from dsom_jax.montecarlo import run, run_keys
@@ -180,12 +181,13 @@ def test_shares_of_grid_and_particles(filters):
     assert float(belief.sum()) == pytest.approx(1.0, abs=1e-5)
 
 
-def test_it_finds_the_robot_keeps_it_and_run_r_is_the_run_alone(filters):
+def test_it_finds_the_robot_keeps_it_and_run_r_is_the_same_in_any_batch(filters):
     episode = tiny_world.drive()
     keys = run_keys(3, 0, 6)
     info = run(filters[0], episode, keys).info
-    alone = run(filters[0], episode, keys[4:5]).info
-    np.testing.assert_array_equal(np.asarray(info.cluster)[4], np.asarray(alone.cluster)[0])
+    # With one other: XLA rounds a batch of one differently.
+    apart = run(filters[0], episode, keys[4:6]).info
+    np.testing.assert_array_equal(np.asarray(info.cluster)[4:6], np.asarray(apart.cluster))
     off = np.asarray(info.cluster) - np.asarray(episode.poses)
     near = (np.hypot(off[..., 0], off[..., 1]) < 0.5) & (np.abs(wrap_angle(off[..., 2])) < math.radians(10))
     assert near[:, -5:].all()
@@ -206,12 +208,12 @@ def test_the_share_of_the_grid_is_checked(filters, share):
 
 
 def test_settings_reach_the_memory(memory):
-    settings = Settings(memory=True, memory_share=(0.2, 0.3), memory_temper=0.07, grid=GRID)
+    belief = GridBeliefConfig(temper=0.07, rows=64, pool=128, samples=64)
+    settings = Settings(memory=True, memory_share=(0.2, 0.3), memory_temper=0.06, belief=belief, grid=GRID)
     built = make_filter("adam_robust", memory.likelihood, tiny_world.grid(), LIDAR, settings)
-    assert isinstance(built, AdamMemory) and built.share == (0.2, 0.3)
-    ranges = tiny_world.drive().inputs.ranges[0]
-    untempered = memory.likelihood.log_likelihood(ranges) / GRID.model.temper
-    np.testing.assert_allclose(built.proposal.likelihood.log_likelihood(ranges), 0.07 * untempered, rtol=1e-5)
+    assert isinstance(built, AdamPlaces) and built.share == (0.2, 0.3) and built.proposal.config == belief
+    assert built.proposal.likelihood is memory.likelihood
+    assert remembering(memory.likelihood, settings).likelihood.config.model.temper == 0.06
     assert memory.likelihood.config.model.temper == GRID.model.temper
 
 
