@@ -223,7 +223,8 @@ def slowly(name, ranges, expected, ends):
 def test_models_behind_one_interface_against_the_slow_references(name):
     episode, model = tiny_world.drive(), MODELS[name]
     poses = episode.poses[:4]
-    ranges = episode.ranges[1].at[3].set(INF).at[7].set(NAN).at[11].add(0.4)
+    # A little off: a reading that is the expected one but for rounding is short or not by chance.
+    ranges = (episode.ranges[1] + 0.013).at[3].set(INF).at[7].set(NAN).at[11].add(0.4)
     rays = RayTables(tiny_world.tables(), tiny_world.LIDAR)
     found = model.log_likelihood(model.tables(rays), poses, ranges)
     expected = np.asarray(tiny_world.cast(tiny_world.tables(), poses, tiny_world.LIDAR), float)
