@@ -161,7 +161,7 @@ def test_a_suite_of_ones_own(tmp_path: Path) -> None:
         ("[[episodes]]\nworld = 1\nobstacle = 3", "unknown field 'obstacle'.*obstacles"),
         ("[[episodes]]\nworld = -1", "world = -1"),
         ("[[episodes]]\nworld = 1\ncells = 8", "cells = 8"),
-        ("[[episodes]]\nworld = 1\ncells = 64\nupdates = 70", "updates = 70.*list"),
+        ("[[episodes]]\nworld = 1\ncells = 64\nupdates = 70", "updates = 70.*whole numbers"),
         ("[[episodes]]\nworld = 1\ncells = 64\nupdates = [1]", "at least 2 updates"),
         ("[[episodes]]\nmap = 'absent.yaml'", "absent.yaml"),
         ("[[episodes]]\nmap = 'office.yaml'\nresolution = 0", "resolution = 0"),
