@@ -103,7 +103,7 @@ def test_bad_input_is_one_line_and_exit_code_2(files):
         ("model: {width: wide}", "model: width: expected a whole number"),
         ("early: {cells: 12}", "multiple of 8"),
         ("- 1", "holds no fields"),
-        ("a: [", "not valid YAML at line 1"),
+        ("a: [", "not valid YAML at line 2"),
     ],
 )
 def test_bad_configurations(tmp_path, text, message):

@@ -13,6 +13,7 @@ import dsom_jax
 import tiny_world
 from dsom_jax import checkpoint
 from dsom_jax.errors import UserError
+from dsom_jax.geometry import relative, wrap_angle
 from dsom_jax.judging.tracking import tracked
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.nn import create_pf_net
@@ -61,9 +62,9 @@ def test_windows_are_pieces_of_paths(pool, windows):
 
 
 def test_odometry_tells_the_motion_with_some_noise(windows):
-    moved = jax.vmap(dsom_jax.relative)(windows.poses[:, :-1], windows.poses[:, 1:])
+    moved = jax.vmap(relative)(windows.poses[:, :-1], windows.poses[:, 1:])
     error = np.array(windows.odometry[:, 1:] - moved)
-    error[..., 2] = np.asarray(dsom_jax.wrap_angle(jnp.asarray(error[..., 2])))
+    error[..., 2] = np.asarray(wrap_angle(jnp.asarray(error[..., 2])))
     # Of 0.2 m or 0.3 rad: standard deviations below 0.02 m and 0.04 rad; five of them.
     assert (np.abs(error) < np.array([0.1, 0.1, 0.2])).all() and np.abs(error).max() > 0
 
@@ -106,7 +107,7 @@ def test_particle_loss_by_hand():
 def test_particles_start_about_the_truth(windows):
     window = jax.tree.map(lambda leaf: leaf[0], windows)
     config = training("pf_net", strays=0.0, start_xy=(0.1, 0.1), start_theta=(0.05, 0.05), particles=12)
-    offset = dsom_jax.relative(window.poses[0], start_poses(jax.random.key(0), window, config))
+    offset = relative(window.poses[0], start_poses(jax.random.key(0), window, config))
     assert np.abs(offset).max() < 0.7
     half = training("pf_net", strays=0.99)
     draw = jax.jit(lambda key: start_poses(key, window, half))
