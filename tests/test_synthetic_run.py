@@ -55,13 +55,16 @@ def test_processes_give_the_numbers_of_one(tmp_path):
         folder.mkdir()
         args = script.Args(only=("printed.mcl", "printed.adam_dsom"), runs=1, workers=workers)
         assert script.run_pieces(script.PIECES, lab.Lab(seed=1), args, folder) == []
-        results = {path.name: lab.read(path) for path in folder.iterdir()}
+        results = {path.name: lab.read(path) for path in folder.glob("*.json")}
         for result in results.values():
+            assert len(result["runs"].steps) == 12
+            # As text, in which no number equals no number.
+            result["runs"] = {name: repr(column.tolist()) for name, column in result["runs"]._asdict().items()}
             result["made"] = {name: result["made"][name] for name in ("config", "seed", "networks", "commit")}
             del result["summary"]["ms_per_step"]
         found.append(results)
     assert found[0] == found[1] and len(found[0]) == 2
-    assert {(r["made"]["seed"], len(r["runs"]["steps"])) for r in found[0].values()} == {(1, 12)}
+    assert {r["made"]["seed"] for r in found[0].values()} == {1}
 
 
 def dying(piece: str, job: str, *others: Any) -> bool:
