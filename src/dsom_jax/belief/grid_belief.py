@@ -25,6 +25,7 @@ from dsom_jax import pose_grid as pg
 from dsom_jax.geometry import compose, rotate
 from dsom_jax.occupancy import OccupancyGrid, dilate, pad
 from dsom_jax.proposals.likelihood_grid import LikelihoodGrid, _columns, _sum_terms, _term_table, beam_choice
+from dsom_jax.proposals.markov_grid import normalised, spline, turned
 from dsom_jax.resampling import pick, pick_in_rows
 from dsom_jax.types import Array, Inputs, Key
 
@@ -432,25 +433,3 @@ def novelty(before: Array, now: Array, odometry: Array) -> Array:
     changed = jnp.where(both, gap, jnp.isfinite(before) != jnp.isfinite(now)) & judged
     share = changed.sum() / jnp.maximum(judged.sum(), 1)
     return jnp.clip(jnp.maximum(moved, (share - 0.2) / 0.3), 0.0, 1.0)
-
-
-def normalised(mass: Array) -> Array:
-    """Masses of sum one."""
-    return mass / jnp.maximum(mass.sum(), 1e-30)
-
-
-def spline(offset: Array) -> tuple[Array, Array]:
-    """Nearest whole number () to ``offset`` and the weights (3, ...) of it and its neighbours.
-
-    Quadratic B-splines: interpolation and a blur with standard deviation half a cell in one.
-    """
-    whole = jnp.round(offset)
-    rest = offset - whole
-    weights = jnp.stack([0.5 * (0.5 - rest) ** 2, 0.75 - rest**2, 0.5 * (0.5 + rest) ** 2])
-    return whole.astype(jnp.int32), weights
-
-
-def turned(belief: Array, bins: Array) -> Array:
-    """Belief (n, K) turned by a number of heading bins ()."""
-    whole, weights = spline(bins)
-    return jnp.stack([w * jnp.roll(belief, whole + a - 1, axis=1) for a, w in enumerate(weights)]).sum(0)
