@@ -50,7 +50,7 @@ class GridBeliefConfig:
         temper: factor on a scan's log-likelihood.
         kidnap: probability of being carried anywhere between two updates.
         slip: probability that the robot stood still, or drove back what the odometry reports as forth.
-        leave: probability of leaving the map at an update, beside what is seen to leave it.
+        leave: probability of leaving the map at an update.
         enter: probability of coming back to it.
         explained: off the map a scan is as likely as on it where the map explains this share of the beams; of cells
             and heading bins, so that even the right one explains half of a clean scan.
@@ -139,7 +139,7 @@ class Places(NamedTuple):
 
 
 class _Judged(NamedTuple):
-    """The belief after one way of updating it; ``level`` () is the mean evidence of a beam."""
+    """The belief after one way of updating it, fields as in :class:`Memory`."""
 
     mass: Array
     rows: Array
