@@ -12,6 +12,7 @@ import pytest
 
 import tiny_world
 from dsom_jax.belief.grid_belief import GridBeliefConfig, grid_belief, novelty
+from dsom_jax.belief.moving import moved_everywhere
 from dsom_jax.geometry import relative
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.occupancy import from_cells
@@ -84,8 +85,8 @@ def slow_move(belief, mass, odometry):
 def test_motion_against_the_slow_reference(room, odometry):
     rng = np.random.default_rng(1)
     mass = np.asarray(room.begin().mass) * rng.random(room.begin().mass.shape)
-    laid = room._laid_out(jnp.asarray(mass, jnp.float32))
-    moved = room._moved(laid, None, room.likelihood.cells, jnp.asarray(odometry, jnp.float32)) * room._real()
+    told = jnp.asarray(odometry, jnp.float32)
+    moved = moved_everywhere(room.likelihood, jnp.asarray(mass, jnp.float32), told, room.config.slip) * room._real()
     expected = slow_move(room, dense(room, mass), odometry)
     # Sums of some 30 products of float32 numbers, each with a relative error of 1e-7 times a few.
     np.testing.assert_allclose(dense(room, moved), expected, rtol=2e-5, atol=1e-6 * expected.max())
@@ -116,9 +117,10 @@ def test_an_update_is_bayes_rule_with_a_place_off_the_map(room):
 def test_evidence_is_that_of_the_beam_model_at_the_cells(tiny):
     likelihood = tiny.likelihood
     episode = tiny_world.drive(2)
-    evidence = np.asarray(tiny._evidence(episode.ranges[0], None))
+    evidence = np.asarray(likelihood.evidence(episode.ranges[0], 32))
     rows = jnp.array([5, 40, 77])
-    assert np.asarray(tiny._evidence(episode.ranges[0], rows)) == pytest.approx(evidence[np.asarray(rows)], rel=1e-6)
+    some = np.asarray(likelihood.evidence(episode.ranges[0], 32, rows))
+    np.testing.assert_allclose(some, evidence[np.asarray(rows)], rtol=1e-6)
     i, j = jnp.divmod(likelihood.cells[rows], likelihood.pose_grid.width)
     poses = cell_pose(likelihood.pose_grid, i, j, jnp.array([3, 8, 12]))
     tables = make_tables(tiny_world.grid(), GRID.raycast, likelihood.config.model.range_max)

@@ -92,7 +92,7 @@ FAULTS = (
     Fault("proposals/markov_grid.py", "still = (inputs.index == 0) | ~known", "still = ~known", "test_markov_grid.py", "number"),
     # Proposals
     Fault("proposals/uniform.py", "(2 * u[2] - 1) * jnp.pi", "u[2] * jnp.pi", "test_proposals.py", "uniform or free"),
-    Fault("proposals/likelihood_grid.py", "return self.config.model.temper * _sum_terms", "return _sum_terms", "test_proposals.py"),
+    Fault("proposals/likelihood_grid.py", "return self.config.model.temper * self.evidence", "return self.evidence", "test_proposals.py"),
     # Runs
     Fault("montecarlo.py", "step_keys = _fold(keys, inputs.index + 1)", "step_keys = _fold(keys, inputs.index)", "test_montecarlo.py", "plain_loop"),
     Fault("montecarlo.py", "jnp.isfinite(inputs.odometry).all(), inputs.odometry, 0.0", "True, inputs.odometry, 0.0", "test_montecarlo.py", "no_number"),

@@ -14,19 +14,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from dsom_jax import checks
 from dsom_jax import pose_grid as pg
+from dsom_jax.belief.moving import moved_everywhere, moved_mass
+from dsom_jax.belief.pool import Pool, draw, even
 from dsom_jax.geometry import compose, rotate
 from dsom_jax.occupancy import OccupancyGrid, dilate, pad
-from dsom_jax.proposals.likelihood_grid import LikelihoodGrid, _columns, _sum_terms, _term_table, beam_choice
-from dsom_jax.proposals.markov_grid import normalised, spline, turned
-from dsom_jax.resampling import pick, pick_in_rows
+from dsom_jax.proposals.likelihood_grid import LikelihoodGrid, beam_choice
+from dsom_jax.proposals.markov_grid import normalised
 from dsom_jax.types import Array, Inputs, Key
 
 _SPILT = 1e-4
@@ -35,8 +35,6 @@ _FAINT = 1e-7
 """Share of the mass below which a row is empty."""
 _AWAY = 0.02
 """Mass off the map from which on the whole grid is judged."""
-_EVEN = np.array([0.6180339887, 0.7548776662, 0.5698402910])
-"""Multiples of these, modulo one, lie evenly in a cube."""
 _NEWS = 0.25
 """Novelty of a scan below which the belief waits for more."""
 
@@ -80,22 +78,6 @@ class GridBeliefConfig:
         checks.share(self, "kidnap leave enter explained", excluding="()")
         checks.share(self, "slip", excluding=")")
         checks.finite(self, "fits")
-
-
-class Pool(NamedTuple):
-    """Cells that stand for a belief, each with 1 / P of its mass.
-
-    Attributes:
-        cell: (P,) flat (i, j) of the likelihood grid.
-        heading: (P,) k.
-        log_prior, log_posterior: (P,) log density in 1 / (m^2 rad) there, before and after the scan, of a belief that
-            knows nothing off the map.
-    """
-
-    cell: Array
-    heading: Array
-    log_prior: Array
-    log_posterior: Array
 
 
 class Memory(NamedTuple):
@@ -207,8 +189,8 @@ class GridBelief:
         )
         scan, pending = jnp.where(counts, inputs.ranges, memory.scan), jnp.where(counts, 0.0, odometry)
         stride = max(1, self.config.pool // self.config.samples)
-        some = jax.tree.map(lambda v: v[::stride], judged.pool)
-        poses, _, _ = self._poses(some, (jnp.arange(some.cell.size)[:, None] * _EVEN) % 1.0)
+        cell, k = judged.pool.cell[::stride], judged.pool.heading[::stride]
+        poses = self.likelihood.poses_in(cell, k, even(cell.size, 3))
         places = Places(judged.pool, poses, judged.off, jnp.where(counts, fresh, 0.0))
         return places, Memory(**judged._asdict(), scan=scan, pending=pending)
 
@@ -223,20 +205,20 @@ class GridBelief:
         cells = self.likelihood.cells.at[rows].get(mode="fill", fill_value=size - 1)
         old = self.likelihood.cells.at[memory.rows].get(mode="fill", fill_value=size)
         slot = jnp.full(size, self.config.rows, jnp.int32).at[old].set(jnp.arange(self.config.rows), mode="drop")
-        moved = self._moved(memory.focus, slot, cells, odometry)
+        moved = moved_mass(self.likelihood, memory.focus, slot, cells, odometry, self.config.slip)
         # Where all of it would leave free space, it stays near.
         moved = jnp.where((rows < count)[:, None], moved + 1e-12, 0.0)
         away = self._away(memory)
         prior = (1 - away) * normalised(moved)
-        posterior, off, level = self._bayes(prior, away, self._evidence(ranges, rows), ranges, fresh)
+        posterior, off, level = self._bayes(prior, away, ranges, fresh, rows)
         focused = (off < _AWAY) & (level > self.config.fits)
         # Rows that have become empty need no following.
         by_row = posterior.sum(-1)
         rows = jnp.where(by_row > _FAINT, rows, count)
         focus = jnp.where((rows < count)[:, None], posterior, 0.0)
-        return _Judged(memory.mass, rows, focus, focused, off, self._draw(cells, prior, posterior))._replace(
-            mass=jax.lax.cond(focused, lambda: memory.mass, lambda: self._spread(rows, focus))
-        )
+        mass = jax.lax.cond(focused, lambda: memory.mass, lambda: self._spread(rows, focus))
+        pool = draw(self.likelihood, cells, prior, posterior, self.config.pool)
+        return _Judged(mass, rows, focus, focused, off, pool)
 
     def _everywhere(self, memory: Memory, rows: Array, odometry: Array, ranges: Array, fresh: Array) -> _Judged:
         """All cells moved and judged; here those who are carried away, or come back, come down."""
@@ -244,19 +226,19 @@ class GridBelief:
         moved = jax.lax.cond(
             (odometry == 0).all(),
             lambda: mass,
-            lambda: self._moved(self._laid_out(mass), None, self.likelihood.cells, odometry) * self._real(),
+            lambda: moved_everywhere(self.likelihood, mass, odometry, self.config.slip) * self._real(),
         )
         away, even = self._away(memory), self._even()
         back = memory.off * self.config.enter / 2 * (even + self.frontier / self._shape[1])
         prior = (1 - away) * normalised((1 - memory.off) * normalised(moved) + back + self.config.kidnap * even)
-        posterior, off, level = self._bayes(prior, away, self._evidence(ranges, None), ranges, fresh)
+        posterior, off, level = self._bayes(prior, away, ranges, fresh)
         by_row = posterior.sum(-1)
         holds = by_row > _FAINT * by_row.sum()
         rows = jnp.flatnonzero(holds, size=self.config.rows, fill_value=self._shape[0]).astype(jnp.int32)
         held = jnp.where(holds, by_row, 0.0).sum() >= (1 - _SPILT) * by_row.sum()
         focused = held & (holds.sum() <= self.config.rows) & (off < _AWAY) & (level > self.config.fits)
         focus = posterior.at[rows].get(mode="fill", fill_value=0.0)
-        pool = self._draw(self.likelihood.cells, prior, posterior)
+        pool = draw(self.likelihood, self.likelihood.cells, prior, posterior, self.config.pool)
         return _Judged(posterior, rows, focus, focused, off, pool)
 
     def _spread(self, rows: Array, focus: Array) -> Array:
@@ -268,10 +250,14 @@ class GridBelief:
         return memory.off * (1 - self.config.enter) + (1 - memory.off) * self.config.leave
 
     def _bayes(
-        self, prior: Array, away: Array, evidence: Array, ranges: Array, fresh: Array
+        self, prior: Array, away: Array, ranges: Array, fresh: Array, rows: Array | None = None
     ) -> tuple[Array, Array, Array]:
-        """Masses (n, K) and () after the scan, which sum to one, and the mean evidence of a beam on the map ()."""
-        valid = (ranges[self._beams()] > -jnp.inf).sum()
+        """Masses (n, K) and () after the scan, which sum to one, and the mean evidence of a beam on the map ().
+
+        ``prior`` (n, K) is that of ``rows`` (n,), or of all free cells; ``away`` () is the mass off the map.
+        """
+        evidence = self.likelihood.evidence(ranges, self.config.beams, rows)
+        valid = (ranges[beam_choice(self.likelihood.lidar.beams, self.config.beams)] > -jnp.inf).sum()
         scale = fresh * self.config.temper
         log_on, log_off = jnp.log(prior) + scale * evidence, jnp.log(away) + scale * self._unmapped() * valid
         top = log_on.max()
@@ -290,65 +276,10 @@ class GridBelief:
         share = self.config.explained
         return share * math.log(hit + other) + (1 - share) * math.log(other)
 
-    def _beams(self) -> Any:
-        return beam_choice(self.likelihood.lidar.beams, self.config.beams)
-
-    def _evidence(self, ranges: Array, rows: Array | None) -> Array:
-        """(n, K) log p(z | x), untempered, at ``rows`` (n,), or at all cells."""
-        likelihood, beams = self.likelihood, self._beams()
-        expected = likelihood.expected if rows is None else likelihood.expected.at[:, rows].get(mode="clip")
-        columns = _columns(likelihood.lidar.angles()[beams], likelihood.config)
-        return _sum_terms(expected, _term_table(ranges[beams], likelihood.config.model), columns)
-
     def _swing(self, odometry: Array) -> Array:
         """Metres that a turn of the base moves a sensor beside its axle."""
         x, y, _ = self.likelihood.lidar.mount
         return math.hypot(x, y) * jnp.abs(odometry[2])
-
-    def _laid_out(self, mass: Array) -> Array:
-        """(H * W, K) of masses (C, K): a cell's neighbours are then found without looking them up."""
-        return jnp.zeros((self.row_of.size - 1, mass.shape[1])).at[self.likelihood.cells].set(mass, mode="drop")
-
-    def _moved(self, mass: Array, slot: Array | None, cells: Array, odometry: Array) -> Array:
-        """Mass (n, K) that a body-frame increment (3,) brings to ``cells`` (n,); what leaves free space is lost.
-
-        ``mass`` (m, K) is that of the cells for which ``slot`` (H * W + 1,) says a row, or of all (H * W, K).
-        """
-        grid = self.likelihood.pose_grid
-        mount = jnp.array(self.likelihood.lidar.mount)[:2]
-        swing = jnp.stack(rotate(odometry[2], *mount)) - mount
-        theta = pg.heading(grid, jnp.arange(grid.headings))
-        padded = jnp.pad(mass, ((0, 1), (0, 0)))
-        forth, back = (
-            jnp.stack(rotate(theta, *step)[::-1]) / grid.resolution
-            for step in (swing + odometry[:2], swing - odometry[:2])
-        )
-        moved = (1 - self.config.slip) * self._shifted(padded, slot, cells, forth)
-        # Slips are rare and need no interpolation.
-        slipped = self._taken(padded, slot, cells, jnp.round(back).astype(jnp.int32))
-        slipped = slipped + self._taken(padded, slot, cells, jnp.zeros_like(back, jnp.int32))
-        return turned(moved + self.config.slip / 2 * slipped, odometry[2] / grid.turn)
-
-    def _shifted(self, padded: Array, slot: Array | None, cells: Array, shift: Array) -> Array:
-        """Mass (n, K) at ``cells`` after heading k moved by ``shift`` (2, K) cells along y and x."""
-        (rows, of_row), (cols, of_col) = (spline(s) for s in shift)
-        total = jnp.zeros((cells.size, padded.shape[1]))
-        for a in range(3):
-            for b in range(3):
-                part = self._taken(padded, slot, cells, jnp.stack([rows + a - 1, cols + b - 1]))
-                total += of_row[a] * of_col[b] * part
-        return total
-
-    def _taken(self, padded: Array, slot: Array | None, cells: Array, shift: Array) -> Array:
-        """Mass (n, K) that lay ``shift`` (2, K) whole cells before ``cells`` (n,); the last row of ``padded`` is 0."""
-        grid = self.likelihood.pose_grid
-        i, j = jnp.divmod(cells, grid.width)
-        y, x = i[:, None] - shift[0], j[:, None] - shift[1]
-        inside = (y >= 0) & (y < grid.height) & (x >= 0) & (x < grid.width)
-        cell = jnp.where(inside, y * grid.width + x, grid.height * grid.width)
-        row = cell if slot is None else slot.at[cell].get(mode="promise_in_bounds")
-        headings = jnp.arange(grid.headings)
-        return padded.reshape(-1).at[row * grid.headings + headings].get(mode="promise_in_bounds")
 
     def _reachable(self, memory: Memory, odometry: Array) -> tuple[Array, Array]:
         """Rows (M,) that the mass of the focus can reach in one update, and whether they are all there."""
@@ -367,32 +298,6 @@ class GridBelief:
         swings = self._swing(odometry) >= (self.config.reach - 2) * grid.resolution
         return self.row_of[cells], (image.sum() <= self.config.rows) & ~swings
 
-    def _draw(self, cells: Array, prior: Array, posterior: Array) -> Pool:
-        """Cells drawn by the posterior (n, K) of ``cells`` (n,), one stratum each along the cells."""
-        n = self.config.pool
-        by_row = posterior.sum(-1)
-        row = pick(jnp.cumsum(by_row), (jnp.arange(n) + 0.5) / n)
-        within = jnp.cumsum(posterior[row], -1)
-        k = pick_in_rows(within, jnp.arange(n), (jnp.arange(n) * _EVEN[0]) % 1.0)
-        cell = cells[row]
-        parts = self.likelihood.parts.at[cell, -1].get(mode="clip").astype(jnp.float32)
-        volume = self.likelihood.map_cells.log_cell_volume + jnp.log(parts)
-        log_prior = jnp.log(prior[row, k] / prior.sum()) - volume
-        return Pool(cell, k, log_prior, jnp.log(posterior[row, k] / by_row.sum()) - volume)
-
-    def _poses(self, pool: Pool, u: Array) -> tuple[Array, Array, Array]:
-        """Base poses (n, 3) within the free space of cells, by ``u`` (n, 3) in [0, 1), and their log densities (n,)."""
-        likelihood = self.likelihood
-        # One number chooses the free part, and what is left of it the place in there.
-        part = pick_in_rows(likelihood.parts, pool.cell, u[:, 0])
-        along = (u[:, 0] * likelihood.parts[pool.cell, -1]) % 1.0
-        side = likelihood.map_cells.height // likelihood.pose_grid.height
-        pairs = zip(divmod(pool.cell, likelihood.pose_grid.width), divmod(part, side), strict=True)
-        i, j = (whole * side + inner for whole, inner in pairs)
-        poses = pg.cell_pose(likelihood.map_cells, i + along - 0.5, j + u[:, 1] - 0.5, pool.heading + u[:, 2] - 0.5)
-        x, y, _ = likelihood.lidar.mount
-        return compose(poses, jnp.array([-x, -y, 0.0])), pool.log_prior, pool.log_posterior
-
     def sample(self, key: Key, prepared: Places, n: int) -> tuple[Array, Array]:
         """``n`` base poses (n, 3) from the belief after the scan, and their log densities."""
         poses, _, log_q = self.draw(key, prepared, n)
@@ -402,8 +307,9 @@ class GridBelief:
         """As :meth:`sample`; between the two the log densities (n,) of the belief before the scan."""
         k_which, k_where = jax.random.split(key)
         which = jnp.floor((jnp.arange(n) + jax.random.uniform(k_which)) * (self.config.pool / n)).astype(jnp.int32)
-        which = jnp.minimum(which, self.config.pool - 1)
-        return self._poses(jax.tree.map(lambda v: v[which], prepared.pool), jax.random.uniform(k_where, (n, 3)))
+        some = jax.tree.map(lambda v: v[jnp.minimum(which, self.config.pool - 1)], prepared.pool)
+        poses = self.likelihood.poses_in(some.cell, some.heading, jax.random.uniform(k_where, (n, 3)).T)
+        return poses, some.log_prior, some.log_posterior
 
 
 def grid_belief(likelihood: LikelihoodGrid, grid: OccupancyGrid, config: GridBeliefConfig) -> GridBelief:

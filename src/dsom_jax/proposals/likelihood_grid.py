@@ -96,23 +96,36 @@ class LikelihoodGrid:
 
     def log_likelihood(self, ranges: Array) -> Array:
         """(C, K) tempered log p(z | x) at the free cells."""
-        picked = beam_choice(self.lidar.beams, self.config.beams)
+        return self.config.model.temper * self.evidence(ranges, self.config.beams)
+
+    def evidence(self, ranges: Array, beams: int, rows: Array | None = None) -> Array:
+        """(n, K) log p(z | x), not tempered, of ``beams`` beams of a scan (B,), at all free cells or ``rows`` (n,)."""
+        picked = beam_choice(self.lidar.beams, beams)
+        expected = self.expected if rows is None else self.expected.at[:, rows].get(mode="clip")
         table = _term_table(ranges[picked], self.config.model)
-        columns = _columns(self.lidar.angles()[picked], self.config)
-        return self.config.model.temper * _sum_terms(self.expected, table, columns)
+        return _sum_terms(expected, table, _columns(self.lidar.angles()[picked], self.config))
 
     def sample(self, key: Key, prepared: pg.ProbabilityMap, n: int) -> tuple[Array, Array]:
         """``n`` base poses (n, 3) from PM, uniform within the free space of a cell, and their log densities."""
         u = jax.random.uniform(key, (5, n))
         cell, k = pg.pick_cells(prepared, u[:2])
+        return self.poses_in(cell, k, u[2:]), self._log_density(prepared, cell, k)
+
+    def poses_in(self, cell: Array, k: Array, u: Array) -> Array:
+        """Base poses (n, 3) in the free space of cells (flat (i, j), k) (n,), by ``u`` (3, n) in [0, 1)."""
         # One number chooses the free part, and what is left of it the place in there.
-        part = pick_in_rows(self.parts, cell, u[2])
-        along = (u[2] * self.parts[cell, -1]) % 1.0
+        part = pick_in_rows(self.parts, cell, u[0])
+        along = (u[0] * self.parts[cell, -1]) % 1.0
         side = self.map_cells.height // self.pose_grid.height
         i, j = (v * side + w for v, w in zip(divmod(cell, self.pose_grid.width), divmod(part, side), strict=True))
-        poses = pg.cell_pose(self.map_cells, i + along - 0.5, j + u[3] - 0.5, k + u[4] - 0.5)
+        poses = pg.cell_pose(self.map_cells, i + along - 0.5, j + u[1] - 0.5, k + u[2] - 0.5)
         x, y, _ = self.lidar.mount
-        return compose(poses, jnp.array([-x, -y, 0.0])), self._log_density(prepared, cell, k)
+        return compose(poses, jnp.array([-x, -y, 0.0]))
+
+    def log_volume(self, cell: Array) -> Array:
+        """Logarithm of the free volume (...) of one heading of cells (flat), in m^2 rad."""
+        parts = self.parts.at[cell, -1].get(mode="clip").astype(jnp.float32)
+        return jnp.log(parts) + self.map_cells.log_cell_volume
 
     def around(self, pose: Array, covariance: Array) -> Array:
         """(C, K) mass of sum one at the free cells, Gaussian about a base pose (3,); no narrower than a cell."""
@@ -142,8 +155,7 @@ class LikelihoodGrid:
 
     def _log_density(self, prepared: pg.ProbabilityMap, cell: Array, k: Array) -> Array:
         """Log density on the free parts of cells (flat (i, j), k)."""
-        volume = jnp.log(self.parts[cell, -1].astype(jnp.float32)) + self.map_cells.log_cell_volume
-        return pg.log_share(prepared, cell, k) - volume
+        return pg.log_share(prepared, cell, k) - self.log_volume(cell)
 
     @property
     def map_cells(self) -> pg.PoseGrid:
