@@ -12,8 +12,8 @@ import pytest
 from dsom_jax.filters.adam import AdamMCL
 from dsom_jax.filters.adam_robust import RobustConfig
 from dsom_jax.filters.mcl import MCL
-from dsom_jax.filters.methods import DRAWN, REAL, Settings
 from dsom_jax.filters.mixture import MixtureMCL
+from dsom_jax.filters.settings import DRAWN, REAL, Settings
 from dsom_jax.filters.updates import FilterConfig
 from dsom_jax.lidar import LidarConfig, LidarNoise
 from dsom_jax.motion import OdometryMotion, OmniMotion

@@ -19,8 +19,9 @@ from dsom_jax.filters.adam import AdamMCL
 from dsom_jax.filters.adam_robust import RobustState
 from dsom_jax.filters.common import ParticleState, heaviest_cluster
 from dsom_jax.filters.mcl import MCL
-from dsom_jax.filters.methods import Settings, make_filter, with_motion, with_sensor
+from dsom_jax.filters.methods import make_filter
 from dsom_jax.filters.mixture import MixtureMCL
+from dsom_jax.filters.settings import Settings, with_motion, with_sensor
 from dsom_jax.filters.updates import FilterConfig
 from dsom_jax.geometry import wrap_angle
 from dsom_jax.montecarlo import run, run_keys

@@ -12,16 +12,8 @@ import pytest
 
 import tiny_world
 from dsom_jax import pose_grid as pg
-from dsom_jax.filters.methods import (
-    EXACT,
-    LEARNED,
-    METHODS,
-    Settings,
-    make_filter,
-    make_proposal,
-    powers_of,
-    sharp,
-)
+from dsom_jax.filters.methods import LEARNED, METHODS, make_filter, make_proposal, powers_of, sharp
+from dsom_jax.filters.settings import EXACT, Settings
 from dsom_jax.geometry import compose
 from dsom_jax.nn import create, evaluation_view
 from dsom_jax.occupancy import is_free, resample

@@ -14,7 +14,8 @@ import pytest
 import tiny_world
 from dsom_jax.data import se2
 from dsom_jax.errors import UserError
-from dsom_jax.filters.methods import REAL, make_filter, make_proposal, watch
+from dsom_jax.filters.methods import make_filter, make_proposal, watch
+from dsom_jax.filters.settings import REAL
 from dsom_jax.live import Localizer
 from dsom_jax.montecarlo import run, run_keys
 from dsom_jax.proposals.likelihood_grid import LikelihoodGridConfig

@@ -15,7 +15,8 @@ from dsom_jax.belief.grid_belief import GridBeliefConfig
 from dsom_jax.filters.adam import AdamMCL
 from dsom_jax.filters.adam_memory import AdamMemory, AdamPlaces
 from dsom_jax.filters.adam_robust import AdamRobust, RobustConfig, RobustState
-from dsom_jax.filters.methods import Settings, build_filter, make_filter, remembering
+from dsom_jax.filters.methods import build_filter, make_filter, remembering
+from dsom_jax.filters.settings import Settings
 from dsom_jax.filters.world import World
 from dsom_jax.geometry import compose, inverse, wrap_angle
 from dsom_jax.montecarlo import run, run_keys

@@ -14,7 +14,8 @@ import tiny_world
 from dsom_jax import pose_grid as pg
 from dsom_jax.filters.adam import AdamMCL
 from dsom_jax.filters.adam_memory import AdamMemory
-from dsom_jax.filters.methods import STANDARD, Settings, build_filter, make_filter, network_of
+from dsom_jax.filters.methods import STANDARD, build_filter, make_filter, network_of
+from dsom_jax.filters.settings import Settings
 from dsom_jax.geometry import wrap_angle
 from dsom_jax.montecarlo import run, run_keys
 from dsom_jax.proposals.hybrid import Hybrid, HybridConfig

@@ -22,7 +22,7 @@ import yaml
 from dsom_jax import localize
 from dsom_jax.data import load_map, save_ros_map, save_tum, se2
 from dsom_jax.errors import UserError, run_cli
-from dsom_jax.filters.methods import REAL
+from dsom_jax.filters.settings import REAL
 from dsom_jax.judging.run_table import read_runs
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.protocol import command

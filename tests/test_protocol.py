@@ -21,7 +21,8 @@ from dsom_jax.cli import parse
 from dsom_jax.data.suite import Suite
 from dsom_jax.episode import Episode
 from dsom_jax.errors import UserError
-from dsom_jax.filters.methods import DRAWN, LEARNED
+from dsom_jax.filters.methods import LEARNED
+from dsom_jax.filters.settings import DRAWN
 from dsom_jax.judging.metrics import measure_errors, pool, summarize
 from dsom_jax.judging.run_table import join, run_rows, write_runs
 from dsom_jax.lidar import LidarConfig

@@ -44,7 +44,7 @@ from tf2_msgs.msg import TFMessage
 
 import tiny_world
 from dsom_jax.data import se2
-from dsom_jax.filters.methods import REAL
+from dsom_jax.filters.settings import REAL
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.raycast import RaycastConfig, make_tables
 from dsom_jax.ros2 import messages

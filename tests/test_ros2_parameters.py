@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from dsom_jax.errors import UserError
-from dsom_jax.filters.methods import DRAWN, REAL
+from dsom_jax.filters.settings import DRAWN, REAL
 from dsom_jax.motion import OmniMotion
 from dsom_jax.ros2 import parameters as p
 

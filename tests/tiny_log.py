@@ -10,7 +10,7 @@ import numpy as np
 
 from dsom_jax.data import save_tum, se2
 from dsom_jax.data.ros_map import save_ros_map
-from dsom_jax.filters.methods import REAL
+from dsom_jax.filters.settings import REAL
 from dsom_jax.raycast import RaycastConfig, make_tables
 from tiny_world import LIDAR, cast, grid
 

@@ -29,7 +29,8 @@ from dsom_jax.cli import parse
 from dsom_jax.compiling import run_options
 from dsom_jax.data.suite import load_suite
 from dsom_jax.errors import UserError, run_cli
-from dsom_jax.filters.methods import Settings, build_filter
+from dsom_jax.filters.methods import build_filter
+from dsom_jax.filters.settings import Settings
 from dsom_jax.judging.quality import make_evaluation
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.nn import DSOMConfig

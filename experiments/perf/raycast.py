@@ -18,7 +18,7 @@ from timing import machine, measure, save
 
 from dsom_jax.compiling import run_options
 from dsom_jax.data.suite import load_suite
-from dsom_jax.filters.methods import Settings, table_for
+from dsom_jax.filters.settings import Settings, table_for
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.proposals.uniform import free_space

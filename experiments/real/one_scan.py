@@ -21,7 +21,8 @@ from run import Args as Series
 from dsom_jax import checkpoint, localize, report
 from dsom_jax.data import RawLog, load_log, load_ros_map
 from dsom_jax.errors import UserError, run_cli
-from dsom_jax.filters.methods import DRAWN, REAL, make_proposal
+from dsom_jax.filters.methods import make_proposal
+from dsom_jax.filters.settings import DRAWN, REAL
 from dsom_jax.judging import quality
 from dsom_jax.occupancy import OccupancyGrid, resample
 from dsom_jax.proposals.dsom import dsom

@@ -14,7 +14,8 @@ from matplotlib.figure import Figure
 from tables import bounds, markdown, number, percent
 
 from dsom_jax import bench, plotting
-from dsom_jax.filters.methods import METHODS, WEIGHT_POWER
+from dsom_jax.filters.methods import METHODS
+from dsom_jax.filters.settings import WEIGHT_POWER
 from dsom_jax.judging.metrics import STEP_BINS
 from dsom_jax.judging.run_table import RunTable, join
 

@@ -29,7 +29,8 @@ from dsom_jax.compiling import run_options
 from dsom_jax.data.suite import Suite, load_suite
 from dsom_jax.episode import Episode
 from dsom_jax.errors import UserError
-from dsom_jax.filters.methods import WEIGHT_POWER, build_filter, network_of, powers_of, sharp
+from dsom_jax.filters.methods import build_filter, network_of, powers_of, sharp
+from dsom_jax.filters.settings import WEIGHT_POWER
 from dsom_jax.judging.run_table import RunTable, stored
 from dsom_jax.montecarlo import run_keys
 from dsom_jax.occupancy import OccupancyGrid

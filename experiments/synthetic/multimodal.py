@@ -18,7 +18,8 @@ from tables import bounds, markdown, number, percent
 
 from dsom_jax import plotting
 from dsom_jax import pose_grid as pg
-from dsom_jax.filters.methods import Settings, make_proposal
+from dsom_jax.filters.methods import make_proposal
+from dsom_jax.filters.settings import Settings
 from dsom_jax.geometry import transform_points
 from dsom_jax.judging import quality
 from dsom_jax.judging.statistics import interval, rate_interval

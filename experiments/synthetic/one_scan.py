@@ -15,7 +15,8 @@ from matplotlib.figure import Figure
 from scenes import Change, Condition, Scans, beams_of, map_and_building, take
 from tables import markdown, percent
 
-from dsom_jax.filters.methods import DRAWN, Settings, make_proposal
+from dsom_jax.filters.methods import make_proposal
+from dsom_jax.filters.settings import DRAWN, Settings
 from dsom_jax.judging import quality
 from dsom_jax.judging.statistics import interval, rate_interval
 from dsom_jax.nn import DSOM

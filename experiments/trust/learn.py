@@ -24,7 +24,8 @@ from dsom_jax.belief.monitor import Signs
 from dsom_jax.belief.verdict import CERTAIN, Head, p_lost
 from dsom_jax.cli import parse
 from dsom_jax.errors import run_cli
-from dsom_jax.filters.methods import REAL, Settings, make_filter, make_proposal, watch
+from dsom_jax.filters.methods import make_filter, make_proposal, watch
+from dsom_jax.filters.settings import REAL, Settings
 from dsom_jax.judging.metrics import ANGLE, POSITION, pose_error
 from dsom_jax.judging.trust import auroc, ece
 from dsom_jax.montecarlo import run, run_keys

@@ -26,7 +26,8 @@ from dsom_jax.data.cut import segment_indices, splice, to_episode, without_repea
 from dsom_jax.data.log import limited
 from dsom_jax.episode import Episode
 from dsom_jax.errors import run_cli
-from dsom_jax.filters.methods import DRAWN, REAL, Settings, make_filter, make_proposal, watch
+from dsom_jax.filters.methods import make_filter, make_proposal, watch
+from dsom_jax.filters.settings import DRAWN, REAL, Settings
 from dsom_jax.judging.metrics import ANGLE, POSITION, pose_error
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.montecarlo import run, run_keys

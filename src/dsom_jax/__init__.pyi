@@ -5,7 +5,8 @@ from .data import load_log, load_map, load_ros_map, load_tum, save_ros_map, save
 from .data.suite import load_suite
 from .episode import Episode
 from .errors import UserError
-from .filters.methods import DRAWN, METHODS, REAL, Settings, build_filter, make_filter, make_proposal
+from .filters.methods import METHODS, build_filter, make_filter, make_proposal
+from .filters.settings import DRAWN, REAL, Settings
 from .judging.metrics import measure, pose_error, summarize
 from .lidar import LidarConfig
 from .live import Answer, Hypothesis, Localizer

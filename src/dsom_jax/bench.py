@@ -16,7 +16,8 @@ from dsom_jax.cli import Advance, parse, progress_bar
 from dsom_jax.data.suite import Suite, load_suite
 from dsom_jax.episode import Episode
 from dsom_jax.errors import UserError, run_cli
-from dsom_jax.filters.methods import METHODS, STANDARD, WEIGHT_POWER, build_filter, network_of
+from dsom_jax.filters.methods import METHODS, STANDARD, build_filter, network_of
+from dsom_jax.filters.settings import WEIGHT_POWER
 from dsom_jax.judging import metrics
 from dsom_jax.judging.foreign import drives_of, named, replies_of_suite
 from dsom_jax.judging.run_table import RunTable, join, run_rows, write_runs

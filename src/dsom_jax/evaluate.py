@@ -19,7 +19,8 @@ from dsom_jax import checkpoint, plotting, report
 from dsom_jax.cli import parse
 from dsom_jax.data.open_map import load_maps
 from dsom_jax.errors import UserError, run_cli
-from dsom_jax.filters.methods import Settings, make_proposal
+from dsom_jax.filters.methods import make_proposal
+from dsom_jax.filters.settings import Settings
 from dsom_jax.geometry import transform_points
 from dsom_jax.judging import quality
 from dsom_jax.lidar import LidarConfig, scan_points

@@ -28,7 +28,8 @@ from dsom_jax.data.cut import far_enough
 from dsom_jax.data.files import read_bytes
 from dsom_jax.data.log import limit_ranges
 from dsom_jax.errors import UserError
-from dsom_jax.filters.methods import REAL, Settings, make_filter, make_proposal, watch
+from dsom_jax.filters.methods import make_filter, make_proposal, watch
+from dsom_jax.filters.settings import REAL, Settings
 from dsom_jax.geometry import wrap_angle
 from dsom_jax.judging.metrics import CONFIDENT
 from dsom_jax.lidar import LidarConfig

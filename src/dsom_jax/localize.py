@@ -26,16 +26,8 @@ from dsom_jax.data.cut import segment_indices, splice, to_episode, without_repea
 from dsom_jax.data.log import STILL, limited
 from dsom_jax.diagnosis.symptoms import cheap_findings
 from dsom_jax.errors import UserError, one_line, run_cli
-from dsom_jax.filters.methods import (
-    DRAWN,
-    REAL,
-    make_filter,
-    make_proposal,
-    sharp_powers,
-    watch,
-    with_motion,
-    with_sensor,
-)
+from dsom_jax.filters.methods import make_filter, make_proposal, watch
+from dsom_jax.filters.settings import DRAWN, REAL, sharp_powers, with_motion, with_sensor
 from dsom_jax.judging import metrics
 from dsom_jax.judging.foreign import named, replies_of
 from dsom_jax.judging.rooms import rooms_of

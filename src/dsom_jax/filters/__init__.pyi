@@ -6,21 +6,11 @@ from .adam_robust import AdamRobust, RobustConfig, RobustState
 from .common import Info, ParticleState, describe
 from .learned import Prior
 from .mcl import MCL
-from .methods import (
-    DRAWN,
-    METHODS,
-    REAL,
-    STANDARD,
-    Settings,
-    build_filter,
-    make_filter,
-    make_proposal,
-    with_motion,
-    with_sensor,
-)
+from .methods import METHODS, STANDARD, build_filter, make_filter, make_proposal
 from .mixture import MixtureMCL
 from .pf_net import PFNetFilter
 from .pfrnn import PFRNNFilter
+from .settings import DRAWN, REAL, Settings, with_motion, with_sensor
 from .updates import FilterConfig
 from .world import World
 

@@ -14,19 +14,8 @@ from dsom_jax import bench, checkpoint, plotting, report
 from dsom_jax.data.suite import Suite
 from dsom_jax.episode import Episode
 from dsom_jax.errors import UserError
-from dsom_jax.filters.methods import (
-    COMBINATIONS,
-    DRAWN,
-    LEARNED,
-    PARTS,
-    REAL,
-    make_filter,
-    make_proposal,
-    network_of,
-    powers_of,
-    sharp,
-    sharp_powers,
-)
+from dsom_jax.filters.methods import COMBINATIONS, LEARNED, make_filter, make_proposal, network_of, powers_of, sharp
+from dsom_jax.filters.settings import DRAWN, PARTS, REAL, sharp_powers
 from dsom_jax.judging.run_table import RunTable, read_runs, write_runs
 from dsom_jax.judging.scores import judged_by
 from dsom_jax.montecarlo import run_keys

@@ -11,7 +11,7 @@ from typing import Any
 
 from dsom_jax.data.documents import read_yaml
 from dsom_jax.errors import UserError
-from dsom_jax.filters.methods import DRAWN, REAL, Settings
+from dsom_jax.filters.settings import DRAWN, REAL, Settings
 from dsom_jax.motion import OdometryMotion, OmniMotion
 
 _REACH = 25.0
