@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import ast
+import re
+import sys
+import tomllib
 from collections.abc import Iterator
+from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import pytest
@@ -157,3 +161,19 @@ def test_an_upward_import_is_seen(where, line):
 )
 def test_host_code_is_seen(line):
     assert host_things(line)
+
+
+def declared() -> set[str]:
+    """Distributions that pyproject.toml installs with the package, with or without an extra."""
+    project = tomllib.loads((ROOT.parents[1] / "pyproject.toml").read_text())["project"]
+    asked = [*project["dependencies"], *project["optional-dependencies"]["drawings"]]
+    return {re.split(r"[^\w.-]", line)[0].lower() for line in asked}
+
+
+@pytest.mark.parametrize("path", [path for path in MODULES if "ros2" not in path.parts], ids=module_name)
+def test_what_is_imported_is_declared(path):
+    """A library that stands on this machine alone, or that another library brings, may be missing on the next."""
+    tops = {name.split(".")[0] for name in imports(path, ast.parse(path.read_text()))}
+    for top in tops - {"dsom_jax", "__future__"} - set(sys.stdlib_module_names):
+        owners = {name.lower() for name in packages_distributions().get(top, [top])}
+        assert owners & (declared() | {"jaxlib"}), f"{top} is of {owners}, which pyproject.toml does not declare"

@@ -11,12 +11,10 @@ import json
 import math
 import time
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from dsom_jax import montecarlo
@@ -25,18 +23,16 @@ from dsom_jax.cache import keep_compiled
 from dsom_jax.compiling import run_options
 from dsom_jax.data import se2
 from dsom_jax.data.cut import far_enough
-from dsom_jax.data.files import read_bytes
 from dsom_jax.data.log import limit_ranges
 from dsom_jax.errors import UserError
 from dsom_jax.filters.methods import make_filter, make_proposal, watch
 from dsom_jax.filters.settings import REAL, Settings
-from dsom_jax.geometry import wrap_angle
-from dsom_jax.judging.metrics import CONFIDENT
 from dsom_jax.lidar import LidarConfig
+from dsom_jax.live.answer import NOWHERE, Answer, Hypothesis, moved, read_saved, said
+from dsom_jax.live.update import around, inner, keys_of, one_update, particles_of
 from dsom_jax.montecarlo import run_keys
 from dsom_jax.occupancy import OccupancyGrid
-from dsom_jax.types import Array, Filter, Inputs, Key
-from dsom_jax.view.story import VERDICTS
+from dsom_jax.types import Filter, Inputs, Key
 
 _BACK = 5.0
 """Seconds: stamps that run back by less are late scans, by more a clock that was set back."""
@@ -49,49 +45,6 @@ _PATIENCE = 10.0
 _ONCE = np.int32(1)
 _RESTORED = np.diag([0.25, 0.25, 0.1]) ** 2
 """Covariance (m, m, rad) added to a pose that was saved: somebody may have pushed the robot."""
-
-
-class Hypothesis(NamedTuple):
-    """A place where the robot may be: share of the probability, mean pose (3,) and covariance (3, 3), map frame."""
-
-    weight: float
-    pose: np.ndarray
-    covariance: np.ndarray
-
-
-class Answer(NamedTuple):
-    """Where the robot is.
-
-    Attributes:
-        stamp: seconds, that of the scan asked about.
-        pose: (3,) of the base in the map frame (m, m, rad); NaN before the first update.
-        covariance: (3, 3) of the particles about ``pose``, other places included; infinite before the first update.
-        verdict: ``localized`` if the pose may be trusted.
-        p_lost: probability that it is more than 2 m or 10 deg off.
-        hypotheses: the places that hold the mass, heaviest first.
-        updated: whether this scan was used; if not, the last answer is carried on by the odometry.
-        note: why a scan was not used, or what was odd about it; empty as a rule.
-        seconds: that the call took.
-    """
-
-    stamp: float
-    pose: np.ndarray
-    covariance: np.ndarray
-    verdict: str
-    p_lost: float
-    hypotheses: tuple[Hypothesis, ...]
-    updated: bool = False
-    note: str = ""
-    seconds: float = 0.0
-
-    @property
-    def localized(self) -> bool:
-        """Whether the pose may be trusted."""
-        return self.verdict == "localized"
-
-
-NOWHERE = Answer(math.nan, np.full(3, np.nan), np.diag([np.inf] * 3), "lost", 1.0, ())
-"""Before the first update."""
 
 
 class Localizer:
@@ -136,14 +89,14 @@ class Localizer:
         blank = Inputs(np.full(self.lidar.beams, np.nan, np.float32), np.zeros(3, np.float32), np.int32(0))  # type: ignore[arg-type]
         start = jax.jit(montecarlo.start, compiler_options=options).lower(self._filter, self._root)
         memory, states = start.out_info
-        step = jax.jit(_step, donate_argnums=(2, 3), compiler_options=options)
+        step = jax.jit(one_update, donate_argnums=(2, 3), compiler_options=options)
         self._start = start.compile()
         self._step = step.lower(self._filter, self._root, memory, states, blank, _ONCE).compile()
-        self._keys_of = jax.jit(_keys_of).lower(self._root, np.uint32(0)).compile()
-        self._particles = jax.jit(_particles).lower(states).compile()
+        self._keys_of = jax.jit(keys_of).lower(self._root, np.uint32(0)).compile()
+        self._particles = jax.jit(particles_of).lower(states).compile()
         self._around = None
-        if hasattr(_inner(self._filter, "filter"), "around"):
-            place = jax.jit(_around, compiler_options=options)
+        if hasattr(inner(self._filter, "filter"), "around"):
+            place = jax.jit(around, compiler_options=options)
             told = np.zeros(3, np.float32), np.zeros((3, 3), np.float32)
             self._around = place.lower(self._filter, self._root, *told).compile()
 
@@ -224,7 +177,7 @@ class Localizer:
         info, covariance = jax.device_get(told)
         self._index, self._forced, self.info = self._index + 1, False, info
         pose, covariance = np.asarray(info.cluster, np.float64), np.asarray(covariance, np.float64)
-        p_lost, verdict, places = _said(info, pose, covariance)
+        p_lost, verdict, places = said(info, pose, covariance)
         self._last = Answer(stamp, pose, covariance, verdict, p_lost, places, updated=True)
         return self._last._replace(seconds=time.perf_counter() - begun)
 
@@ -236,8 +189,8 @@ class Localizer:
     def _carried(self, stamp: float, note: str = "") -> Answer:
         """The last answer moved on by the odometry."""
         last, driven = self._last, self._driven
-        pose, covariance = _moved(last.pose, last.covariance, driven)
-        places = tuple(Hypothesis(h.weight, *_moved(h.pose, h.covariance, driven)) for h in last.hypotheses)
+        pose, covariance = moved(last.pose, last.covariance, driven)
+        places = tuple(Hypothesis(h.weight, *moved(h.pose, h.covariance, driven)) for h in last.hypotheses)
         return last._replace(stamp=stamp, pose=pose, covariance=covariance, hypotheses=places, updated=False, note=note)
 
     def answer(self) -> Answer:
@@ -254,7 +207,7 @@ class Localizer:
             TypeError: the filter cannot start from a pose.
         """
         if self._around is None:
-            kind = type(_inner(self._filter, "filter")).__name__
+            kind = type(inner(self._filter, "filter")).__name__
             raise TypeError(f"{kind} cannot start from a pose; use AdaM robust")
         told = np.asarray(pose, np.float64), np.asarray(covariance, np.float64)
         if told[0].shape != (3,) or told[1].shape != (3, 3) or not all(np.isfinite(v).all() for v in told):
@@ -296,7 +249,7 @@ class Localizer:
 
     def state(self) -> Any:
         """The filter's own state after the last update, a copy."""
-        return jax.tree.map(lambda leaf: np.array(leaf[0]), jax.device_get(_inner(self._states, "state")))
+        return jax.tree.map(lambda leaf: np.array(leaf[0]), jax.device_get(inner(self._states, "state")))
 
     def particles(self) -> tuple[np.ndarray, np.ndarray]:
         """Poses (N, 3) in the map frame, moved on by the odometry, and weights (N,) that sum to one."""
@@ -317,7 +270,7 @@ class Localizer:
         Raises:
             UserError: no such file, not one of ours, of another map, or off the free space of this one.
         """
-        pose, covariance, trusted = _read_saved(path, self._map())
+        pose, covariance, trusted = read_saved(path, self._map())
         if trusted:
             self.set_pose(pose, covariance + _RESTORED)
         return trusted
@@ -325,102 +278,3 @@ class Localizer:
     def _map(self) -> list[Any]:
         """What tells maps apart."""
         return [*self.grid.shape, self.grid.resolution, *np.asarray(self.grid.origin, np.float64).round(4).tolist()]
-
-
-def _step(filter: Filter, keys: Key, memory: Any, states: Any, inputs: Inputs, once: Array) -> tuple[Any, Any, Any]:
-    """One update of one run: memory, states (1, ...), and (info, covariance (3, 3)) without the axis of runs.
-
-    ``once`` () is 1, which XLA must not know: a loop that is not unrolled is compiled as that of ``montecarlo.run``,
-    and rounds as it does.
-    """
-    told = jax.eval_shape(montecarlo.update, filter, keys, memory, states, inputs)[2]
-    rows = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), inputs)
-    infos = jax.tree.map(lambda leaf: jnp.zeros((2, *leaf.shape), leaf.dtype), told)
-
-    def update(carry: tuple[Array, Any, Any, Any]) -> tuple[Array, Any, Any, Any]:
-        n, memory, states, infos = carry
-        now = jax.tree.map(lambda leaf: jax.lax.dynamic_index_in_dim(leaf, n, keepdims=False), rows)
-        memory, states, info = montecarlo.update(filter, keys, memory, states, now)
-        put = partial(jax.lax.dynamic_update_index_in_dim, index=n, axis=0)
-        return n + 1, memory, states, jax.tree.map(put, infos, info)
-
-    start = (jnp.int32(0), memory, states, infos)
-    _, memory, states, infos = jax.lax.while_loop(lambda carry: carry[0] < once, update, start)
-    info = jax.tree.map(lambda leaf: leaf[0, 0], infos)
-    poses, weights = _particles(states)
-    return memory, states, (info, _second_moment(poses[0], weights[0], info.cluster))
-
-
-def _said(info: Any, pose: np.ndarray, covariance: np.ndarray) -> tuple[float, str, tuple[Hypothesis, ...]]:
-    """P(lost), verdict and hypotheses; filters that give none are lost by ``lost``, and their cluster is the place."""
-    p_lost = float(getattr(info, "p_lost", info.lost))
-    given = getattr(info, "verdict", None)
-    plain = "localized" if p_lost < CONFIDENT else "lost"
-    verdict = plain if given is None else VERDICTS[int(given)]
-    places = getattr(info, "hypotheses", None)
-    if places is None:
-        return p_lost, verdict, (Hypothesis(1.0 - p_lost, pose, covariance),)
-    rows = sorted(zip(*places, strict=True), key=lambda row: -float(row[0]))
-    return (
-        p_lost,
-        verdict,
-        tuple(Hypothesis(float(w), np.asarray(m, float), np.asarray(c, float)) for w, m, c in rows if w > 0),
-    )
-
-
-def _around(filter: Any, keys: Key, pose: Array, covariance: Array) -> tuple[Any, Any, Array]:
-    """Memory and states (1, ...) about a pose, and the share of it that lies on free space."""
-    place = partial(filter.around, pose=pose, covariance=covariance)
-    memory, states, free = jax.vmap(place, out_axes=(None, 0, 0))(keys)
-    return memory, states, free[0]
-
-
-def _inner(watched: Any, part: str) -> Any:
-    """What a :class:`dsom_jax.belief.watched.Watched` watches, or its state; other filters are their own."""
-    return getattr(watched, part, watched)
-
-
-def _keys_of(root: Key, number: Array) -> Key:
-    """(1,) keys of a start."""
-    return jax.vmap(lambda key: jax.random.fold_in(key, number))(root)
-
-
-def _particles(states: Any) -> tuple[Array, Array]:
-    """Poses (1, N, 3) and weights (1, N) of any filter's states."""
-    states = _inner(states, "state")
-    if hasattr(states, "log_weights"):
-        return states.poses, jax.nn.softmax(states.log_weights, axis=-1)
-    return states.poses, states.normalised
-
-
-def _second_moment(poses: Array, weights: Array, centre: Array) -> Array:
-    """(3, 3) of weighted poses (N, 3) about a pose (3,)."""
-    off = poses - centre
-    off = off.at[:, 2].set(wrap_angle(off[:, 2]))
-    return (weights[:, None] * off).T @ off
-
-
-def _moved(pose: np.ndarray, covariance: np.ndarray, driven: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pose (3,) and covariance (3, 3) after a body-frame motion (3,) that is known exactly."""
-    if not np.isfinite(pose).all() or not driven.any():
-        return pose, covariance
-    after = se2.compose(pose, driven)
-    lever = np.eye(3)
-    lever[:2, 2] = pose[1] - after[1], after[0] - pose[0]
-    return after, lever @ covariance @ lever.T
-
-
-def _read_saved(path: str | Path, of_map: list[Any]) -> tuple[np.ndarray, np.ndarray, bool]:
-    """Pose, covariance and whether they were trusted, of a file that :meth:`Localizer.save` wrote."""
-    try:
-        saved = json.loads(read_bytes(path, "saved pose"))
-        pose, covariance = np.array(saved["pose"], float), np.array(saved["covariance"], float)
-        trusted, same = saved["verdict"] == "localized", saved["map"] == of_map
-        sound = pose.shape == (3,) and covariance.shape == (3, 3)
-    except (ValueError, KeyError, TypeError):
-        sound = False
-    if not sound or (trusted and not (np.isfinite(pose).all() and np.isfinite(covariance).all())):
-        raise UserError(f"{path}: not a pose that Localizer.save wrote; delete it, a new one will be written")
-    if not same:
-        raise UserError(f"{path}: was saved on another map; delete it, a new one will be written")
-    return pose, covariance, trusted
