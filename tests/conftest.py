@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
+from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -34,6 +35,21 @@ def pytest_unconfigure() -> None:
     """The process that made the folder removes it; workers found it in their environment."""
     if OWN_CACHE:
         shutil.rmtree(OWN_CACHE, ignore_errors=True)
+
+
+MAPPINGS = Path("/proc/self/maps")
+MANY = 20_000
+"""Linux ends a process with 65,530 mappings, and what one file of tests compiles takes up to 8,000."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _few_mappings():
+    """A worker forgets what it has compiled before the mappings of its memory run out."""
+    yield
+    if MAPPINGS.exists() and MAPPINGS.read_bytes().count(b"\n") > MANY:
+        import jax
+
+        jax.clear_caches()
 
 
 @pytest.fixture(scope="session", autouse=True)
