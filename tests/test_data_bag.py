@@ -53,6 +53,25 @@ def test_storage_file_without_its_folder(tmp_path: Path, form: str) -> None:
     np.testing.assert_array_equal(load_log(alone).ranges, load_log(folder).ranges)
 
 
+@pytest.mark.parametrize(
+    ("field", "value", "where"),
+    [
+        ("name: /scan", "name: [/scan, /b]", r"Expected `str`, got `array` - at .*topic_metadata\.name"),
+        ("type: sensor_msgs/msg/LaserScan", "type: {a: 1}", r"Expected `str`, got `object` .*metadata\.type"),
+        ("storage_identifier: sqlite3", "storage_identifier: [1]", "Expected `str`.*storage_identifier"),
+        ("message_count: 5", "message_count: many", "Expected `int`, got `str`.*message_count"),
+        ("rosbag2_bagfile_information:", "other:", "missing required field `rosbag2_bagfile_information`"),
+    ],
+)
+def test_metadata_of_wrong_types(tmp_path: Path, field: str, value: str, where: str) -> None:
+    metadata = write_bag(tmp_path, "db3", drive()) / "metadata.yaml"
+    text = metadata.read_text()
+    assert field in text
+    metadata.write_text(text.replace(field, value))
+    with pytest.raises(UserError, match=rf"metadata\.yaml: .*{where}.*reindex"):
+        load_log(metadata.parent)
+
+
 def test_upside_down_laser_through_a_chain_of_frames(tmp_path: Path) -> None:
     entries = drive(mount=())
     # base_link is a child of the frame that odometry moves; the laser hangs on a mast, head down and turned.

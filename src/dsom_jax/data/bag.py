@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from dsom_jax.data import se2
@@ -61,6 +62,34 @@ class Drive:
     base: str
 
 
+class Topic(msgspec.Struct):
+    """A topic in the metadata.yaml of a rosbag2; what is not read of it may be anything."""
+
+    name: str
+    type: str
+
+
+class Counted(msgspec.Struct):
+    """How often a topic was recorded."""
+
+    topic_metadata: Topic
+    message_count: int
+
+
+class Information(msgspec.Struct):
+    """``rosbag2_bagfile_information``, what a rosbag2 is opened by."""
+
+    storage_identifier: str
+    relative_file_paths: list[str]
+    topics_with_message_count: list[Counted]
+
+
+class Metadata(msgspec.Struct):
+    """The metadata.yaml of a rosbag2."""
+
+    rosbag2_bagfile_information: Information
+
+
 def is_bag(path: Path) -> bool:
     """Whether a path looks like a bag."""
     return path.suffix.lower() in SUFFIXES or (path.is_dir() and (path / "metadata.yaml").is_file())
@@ -101,7 +130,7 @@ def open_bag(path: Path) -> Iterator[Any]:
     if not path.is_dir():
         check_file(path, "bag")
     elif (path / "metadata.yaml").exists():
-        read_yaml(path / "metadata.yaml", "description of the bag")  # bounded, as that of the library is not
+        _check_metadata(path / "metadata.yaml")
     try:
         reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
         reader.open()
@@ -113,6 +142,14 @@ def open_bag(path: Path) -> Iterator[Any]:
         yield reader
     finally:
         reader.close()
+
+
+def _check_metadata(path: Path) -> None:
+    """UserError unless what is read of a metadata.yaml is bounded and of the right types: rosbags asks neither."""
+    try:
+        msgspec.convert(read_yaml(path, "description of the bag"), Metadata)
+    except msgspec.ValidationError as error:
+        raise UserError(f"{path}: {error}; restore it, or make it anew by ros2 bag reindex") from None
 
 
 def listed(topics: dict[str, str]) -> str:

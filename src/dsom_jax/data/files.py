@@ -134,19 +134,19 @@ def _unpacked(content: bytes) -> tuple[str, io.BufferedIOBase | io.BytesIO]:
 
 def read_arrays(source: str | Path | bytes, what: str, most: int = 512 * MB) -> dict[str, np.ndarray]:
     """Arrays of an npz file (or of its content) that unpack to at most ``most`` bytes; none of them holds objects."""
-    name = f"{what}" if isinstance(source, bytes) else f"{source}"
+    name, kind = (what, "readable") if isinstance(source, bytes) else (f"{source}", f"a {what}")
     content = source if isinstance(source, bytes) else read_bytes(source, what)
     try:
         unpacked = sum(entry.file_size for entry in zipfile.ZipFile(io.BytesIO(content)).infolist())
         if unpacked > most:
-            raise UserError(f"{name}: unpacks to {unpacked / MB:.0f} MB, the limit for a {what} is {most / MB:g} MB")
+            raise UserError(f"{name}: unpacks to {unpacked / MB:.0f} MB, the limit is {most / MB:g} MB")
         with np.load(io.BytesIO(content), allow_pickle=False) as stored:
             return {key: stored[key] for key in stored.files}
     except UserError:
         raise
     except Exception as error:
         # zipfile, zlib and numpy raise a dozen unrelated kinds for damaged files.
-        raise UserError(f"{name}: not a {what} ({error}); it is damaged, make it again") from None
+        raise UserError(f"{name}: not {kind} ({error}); it is damaged, make it again") from None
 
 
 @contextmanager
