@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
+import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
@@ -161,6 +162,13 @@ def test_an_upward_import_is_seen(where, line):
 )
 def test_host_code_is_seen(line):
     assert host_things(line)
+
+
+def test_one_robot_needs_no_pictures():
+    """What runs on a robot loads neither what draws pages nor what reads bags."""
+    words = [sys.executable, "-c", "import sys, dsom_jax.live; print(*sys.modules)"]
+    done = subprocess.run(words, capture_output=True, text=True, check=True)
+    assert not {"matplotlib", "rosbags", "scipy.signal"} & set(done.stdout.split())
 
 
 def declared() -> set[str]:

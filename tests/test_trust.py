@@ -79,18 +79,6 @@ def test_risk_of_a_perfect_order_begins_when_the_right_ones_run_out():
     assert t.risk_at_coverage(p, wrong, 0.95) == pytest.approx(5 / 95)
 
 
-def test_delays_of_failures():
-    p = [[0.0, 0.0, 0.0, 0.2, 0.9, 0.0, 0.0, 0.9, 0.0, 0.0], [0.9, 0.9, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]]
-    wrong = [[0, 1, 1, 1, 0, 0, 1, 0, 1, 1], [1, 0, 0, 0, 0, 0, 0, 0, 0, 0]]
-    found = t.detections(p, wrong, alarm=0.1)
-    np.testing.assert_array_equal(found.delay, [2, math.nan, math.nan, 0])
-    assert found.missed == 0.5 and found.quantile(0.5) == 2 and found.quantile(0.9) == math.inf
-    # Unknown updates neither begin nor end a failure, nor do they count.
-    known = [[1, 1, 0, 1, 1, 1, 1, 0, 1, 1], [1] * 10]
-    np.testing.assert_array_equal(t.detections(p, wrong, known, alarm=0.1).delay, [1, math.nan, 0])
-    assert math.isnan(t.detections(np.zeros(5), np.zeros(5)).quantile(0.5))
-
-
 def test_nothing_to_say_is_nan():
     for wrong in (np.zeros(40, bool), np.ones(40, bool)):
         assert math.isnan(t.auroc(P, wrong)) and math.isnan(t.fpr_at_tpr(P, wrong))

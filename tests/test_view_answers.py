@@ -1,14 +1,15 @@
-"""Answers from particles: places, spread and verdict, held against clouds whose moments are known."""
+"""Answers of run 0: what the filter says, and the spread of its particles, held against clouds of known moments."""
 
 from __future__ import annotations
 
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
 
-from dsom_jax.view.answers import HEAD, answers, from_particles, judged, particle_weights, spread, write_answers
-from dsom_jax.view.story import Hypotheses
+from dsom_jax.belief.verdict import Verdict
+from dsom_jax.live.answer import said
+from dsom_jax.view.answers import HEAD, answers, particle_weights, spread, write_answers
+from dsom_jax.view.story import VERDICTS, Hypotheses
 
 SD = np.array([0.2, 0.1, 0.05])
 PLACES = np.array([[2.0, 1.0, 0.5], [9.0, -3.0, -2.0], [5.0, 8.0, np.pi - 0.01]])
@@ -25,28 +26,6 @@ def cloud(seed=0, n=3000):
     return poses[None], np.full((1, len(poses)), 1 / len(poses))
 
 
-def test_places_of_a_cloud():
-    weights, means, covariances = (part[0] for part in from_particles(*cloud()))
-    np.testing.assert_allclose(weights[:3], SHARES, atol=1e-9)  # three standard deviations are well within a metre
-    assert not weights[3:].any()
-    gap = means[:3] - PLACES
-    gap[:, 2] = (gap[:, 2] + np.pi) % (2 * np.pi) - np.pi
-    counts = 3000 * np.array(SHARES)[:, None]
-    assert (np.abs(gap) < 4 * SD / np.sqrt(counts)).all()
-    # The relative standard deviation of a variance of n draws is sqrt(2 / n).
-    seen = np.diagonal(covariances[:3], axis1=1, axis2=2)
-    assert (np.abs(seen / SD**2 - 1) < 4 * np.sqrt(2 / counts)).all()
-
-
-def test_weights_count_not_numbers():
-    poses, weights = cloud()
-    far = np.hypot(*(poses[0, :, :2] - PLACES[1, :2]).T) < 2
-    weights = np.where(far, 5.0, 1.0)[None]
-    weights /= weights.sum()
-    found = from_particles(poses, weights)
-    np.testing.assert_allclose(found.weights[0, :3], np.array([1.5, 0.6, 0.1]) / 2.2, atol=1e-9)
-
-
 def test_spread_around_the_answer():
     poses, weights = cloud()
     sd = spread(PLACES[2:3], poses, weights)
@@ -61,35 +40,33 @@ def places(*weights):
     return Hypotheses(padded, np.zeros((1, 6, 3)), np.zeros((1, 6, 3, 3)))
 
 
-@pytest.mark.parametrize(
-    ("lost", "weights", "verdict"),
-    [
-        (0.01, (0.99,), "localized"),
-        (0.4, (0.6, 0.4), "ambiguous"),
-        (0.5, (0.5, 0.02), "lost"),
-        (0.9, (0.1, 0.1, 0.05), "lost"),
-    ],
-)
-def test_verdicts_by_thresholds(lost, weights, verdict):
-    assert judged(np.array([lost]), places(*weights)) == (verdict,)
+def result(verdicts=(Verdict.LOCALIZED,), p_lost=0.02, own=None):
+    """Diagnostics and states of one run of as many updates as verdicts, all with the same particles."""
+    count, (poses, weights) = len(verdicts), cloud(n=300)
+    own = own or places(0.7, 0.3)
+    info = SimpleNamespace(
+        p_lost=np.full((1, count), p_lost),
+        verdict=np.array([verdicts], np.int8),
+        hypotheses=Hypotheses(*(np.repeat(part[None], count, axis=1) for part in own)),
+    )
+    kept = SimpleNamespace(poses=np.repeat(poses, count, 0), log_weights=np.log(np.repeat(weights, count, 0)))
+    return info, kept
 
 
-def result(**extra):
-    poses, weights = cloud(n=300)
-    info = SimpleNamespace(lost=np.array([[0.02]]), **extra)
-    return info, SimpleNamespace(poses=poses, log_weights=np.log(weights))
+def test_answers_are_what_the_filter_says():
+    info, kept = result((Verdict.AMBIGUOUS,), 0.3)
+    told = answers(np.array([3.0]), PLACES[None, :1], info, kept)
+    assert told.p_lost == [0.3] and told.verdicts == ("ambiguous",)
+    np.testing.assert_array_equal(told.hypotheses.weights, places(0.7, 0.3).weights)
 
 
-def test_what_a_filter_says_itself_comes_first():
-    own = places(0.7, 0.3)
-    batched = Hypotheses(*(part[None] for part in own))
-    info, kept = result(p_lost=np.array([[0.3]]), verdict=np.array([[1]]), hypotheses=batched)
-    said = answers(np.array([3.0]), PLACES[None, :1], info, kept)
-    assert said.p_lost == [0.3] and said.verdicts == ("ambiguous",)
-    np.testing.assert_array_equal(said.hypotheses.weights, own.weights)
-    info, kept = result()
-    said = answers(np.array([3.0]), PLACES[None, :1], info, kept)
-    assert said.p_lost == [0.02] and said.verdicts == ("localized",) and (said.hypotheses.weights > 0).sum() == 3
+def test_a_verdict_has_one_name_wherever_it_is_told():
+    names = tuple(verdict.name.lower() for verdict in Verdict)
+    info, kept = result(tuple(Verdict))
+    assert answers(np.arange(4.0), np.zeros((1, 4, 3)), info, kept).verdicts == names == VERDICTS
+    live = [SimpleNamespace(p_lost=0.5, lost=0.5, verdict=np.int8(verdict)) for verdict in Verdict]
+    assert tuple(said(info, np.zeros(3), np.eye(3))[1] for info in live) == names
+    assert set(names) == {"localized", "ambiguous", "off_map", "lost"}  # the page has colours for these
 
 
 def test_states_of_both_kinds_have_weights():
@@ -99,7 +76,7 @@ def test_states_of_both_kinds_have_weights():
 
 
 def test_file_of_answers(tmp_path):
-    info, kept = result()
+    info, kept = result(own=places(0.6, 0.3, 0.1))
     first = answers(np.array([3.0]), PLACES[None, :1], info, kept)
     again = answers(np.array([3.0]), PLACES[None, 1:2], info, kept)
     write_answers(tmp_path / "answers.csv", [first, again])

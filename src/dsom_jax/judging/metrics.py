@@ -26,8 +26,6 @@ ANGLE = math.radians(10)
 HOLD = 5
 """Consecutive updates that make a run converged."""
 STRICT_POSITION, STRICT_ANGLE = 0.5, math.radians(5)
-CONFIDENT = 0.05
-"""A filter that says of itself no more than this probability of being lost claims to know where it is."""
 STEP_BINS = {"0-20": (0, 20), "20-40": (21, 40), "40-60": (41, 60), ">60": (61, math.inf)}
 """Converging steps of the paper's histogram, both ends included."""
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from dsom_jax.belief.verdict import Verdict
+from dsom_jax.belief.verdict import CERTAIN, Verdict
 from dsom_jax.data import save_tum
 from dsom_jax.episode import Episode
 from dsom_jax.judging import metrics
@@ -56,7 +56,7 @@ def replies(info: Any, estimate: str) -> Replies:
     poses = np.asarray(getattr(info, estimate))
     if hasattr(info, "verdict"):
         return Replies(poses, p_lost, np.asarray(info.verdict) == Verdict.LOCALIZED)
-    return Replies(poses) if np.isnan(p_lost).all() else Replies(poses, p_lost, p_lost < metrics.CONFIDENT)
+    return Replies(poses) if np.isnan(p_lost).all() else Replies(poses, p_lost, p_lost < CERTAIN)
 
 
 def verdicts(infos: Sequence[Any]) -> dict[str, Any]:

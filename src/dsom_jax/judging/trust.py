@@ -1,39 +1,21 @@
 """Does an answer know when it is wrong? How good the probabilities ``p_lost`` are, held against what was wrong.
 
-``p_lost`` is P(the reported pose is more than 2 m or 10 deg off); *wrong* is what happened. A failure is what is to be
-detected: an alarm is raised where ``p_lost`` is at least a threshold. Host code, float64 NumPy and SciPy. A number that
-does not exist (nothing was ever wrong, or everything was) is NaN.
+``p_lost`` is P(the reported pose is more than 2 m or 10 deg off); *wrong* is what happened. An alarm is raised where
+``p_lost`` is at least a threshold. Host code, float64 NumPy and SciPy. A number that does not exist (nothing was ever
+wrong, or everything was) is NaN.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy import stats
 
 BINS = 15
 COVERAGES = (0.5, 0.8, 0.9, 0.95)
-ALARM = 0.05
-"""An answer with at least this probability of being lost is not claimed to be right."""
-
-
-class Detections(NamedTuple):
-    """Failures one by one (F,): ``delay`` updates from the first wrong one to the alarm, NaN if none came in time."""
-
-    delay: np.ndarray
-
-    @property
-    def missed(self) -> float:
-        """Share of the failures that ended, with their run or by chance, before any alarm."""
-        return float(np.isnan(self.delay).mean()) if len(self.delay) else math.nan
-
-    def quantile(self, q: float) -> float:
-        """Quantile of the delay over all failures, in updates; infinite where so many were missed, NaN without any."""
-        ranked = np.sort(np.where(np.isnan(self.delay), np.inf, self.delay))
-        return float(ranked[max(math.ceil(q * len(ranked)) - 1, 0)]) if len(ranked) else math.nan
 
 
 def auroc(p_lost: Any, wrong: Any) -> float:
@@ -87,24 +69,6 @@ def risk_at_coverage(p_lost: Any, wrong: Any, coverage: float) -> float:
     share = np.bincount(group, wrong) / sizes
     taken = np.clip(count - (np.cumsum(sizes) - sizes), 0, sizes)
     return float((taken * share).sum() / count)
-
-
-def detections(p_lost: Any, wrong: Any, known: Any = True, alarm: float = ALARM) -> Detections:
-    """How soon failures are noticed, in runs (R, T) or one run (T,).
-
-    A failure begins with the first wrong answer after a right one, or with the run, and ends with the next right one.
-    Updates that are not ``known`` (no reference; broadcast) are passed over. An alarm in the same update is a delay
-    of 0.
-    """
-    p, wrong = np.atleast_2d(np.asarray(p_lost, float)), np.atleast_2d(np.asarray(wrong, bool))
-    known = np.broadcast_to(np.asarray(known, bool), p.shape)
-    delays: list[float] = []
-    for alarmed, failed in ((row[k] >= alarm, w[k]) for row, w, k in zip(p, wrong, known, strict=True)):
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], failed, [False]]).astype(int)))
-        for start, end in edges.reshape(-1, 2):
-            raised = np.flatnonzero(alarmed[start:end])
-            delays.append(float(raised[0]) if len(raised) else math.nan)
-    return Detections(np.array(delays))
 
 
 def trust(p_lost: Any, wrong: Any, coverages: Sequence[float] = COVERAGES) -> dict[str, Any]:

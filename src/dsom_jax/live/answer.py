@@ -9,11 +9,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from dsom_jax.belief.verdict import CERTAIN, Verdict
 from dsom_jax.data import se2
 from dsom_jax.data.files import read_bytes
 from dsom_jax.errors import UserError
-from dsom_jax.judging.metrics import CONFIDENT
-from dsom_jax.view.story import VERDICTS
 
 
 class Hypothesis(NamedTuple):
@@ -63,8 +62,8 @@ def said(info: Any, pose: np.ndarray, covariance: np.ndarray) -> tuple[float, st
     """P(lost), verdict and hypotheses; filters that give none are lost by ``lost``, and their cluster is the place."""
     p_lost = float(getattr(info, "p_lost", info.lost))
     given = getattr(info, "verdict", None)
-    plain = "localized" if p_lost < CONFIDENT else "lost"
-    verdict = plain if given is None else VERDICTS[int(given)]
+    plain = Verdict.LOCALIZED if p_lost < CERTAIN else Verdict.LOST
+    verdict = (plain if given is None else Verdict(int(given))).name.lower()
     places = getattr(info, "hypotheses", None)
     if places is None:
         return p_lost, verdict, (Hypothesis(1.0 - p_lost, pose, covariance),)

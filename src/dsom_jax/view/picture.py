@@ -7,7 +7,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from dsom_jax.judging.metrics import CONFIDENT, POSITION
+from dsom_jax.belief.verdict import CERTAIN
+from dsom_jax.judging.metrics import POSITION
 from dsom_jax.occupancy import from_cells
 from dsom_jax.plotting.common import legend
 from dsom_jax.plotting.maps import map_view
@@ -32,7 +33,7 @@ def trajectory_figure(plan: Plan, drive: DriveStory) -> Figure:
     axes[0].plot(*_broken(drive.estimates, drive.kidnapped).T, color=ESTIMATE, linewidth=2, label="estimate")
     axes[0].plot(*drive.estimates[0, :2], "o", color=ESTIMATE, label="first answer")
     axes[0].set_title(drive.name)
-    _over_updates(axes[1], drive, drive.p_lost, CONFIDENT, LOST, "P(lost)")
+    _over_updates(axes[1], drive, drive.p_lost, CERTAIN, LOST, "P(lost)")
     axes[1].set_ylim(-0.02, 1.02)
     if judged:
         _over_updates(axes[2], drive, np.maximum(drive.errors()[0], 0.01), POSITION, TRUTH, "error [m]")

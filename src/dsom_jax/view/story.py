@@ -8,10 +8,11 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from dsom_jax.belief.verdict import Verdict
 from dsom_jax.judging.metrics import ANGLE, POSITION
 
-VERDICTS = ("localized", "ambiguous", "off_map", "lost")
-"""Verdicts that a page has colours for, from the best to the worst."""
+VERDICTS = tuple(verdict.name.lower() for verdict in Verdict)
+"""By number, from the best to the worst; a page has a colour for each."""
 
 
 @dataclass(frozen=True)
