@@ -100,8 +100,14 @@ def command(monkeypatch, *words: str) -> None:
     run_cli(bench.main)
 
 
+def benchmark(suite, methods, runs, particles, seed=0, progress=None):
+    """The contents of ``bench.json``."""
+    settings = bench.Settings(runs, particles, seed=seed)
+    return bench.summary(suite, bench.collect(suite, methods, settings, progress), settings)
+
+
 def test_known_filters_get_their_numbers(suite):
-    data = bench.benchmark(suite, ("mcl", "adam_likelihood_grid", "robust_likelihood_grid"), runs=4, particles=5)
+    data = benchmark(suite, ("mcl", "adam_likelihood_grid", "robust_likelihood_grid"), runs=4, particles=5)
     assert set(data) >= {"suite", "runs", "particles", "t_cut", "seed", "weight_power", "device", "methods"}
     assert (data["suite"], data["runs"], data["particles"], data["t_cut"], data["seed"]) == ("made-up", 4, 5, 0.6, 0)
     lost, late, soon = data["methods"].values()
@@ -121,7 +127,7 @@ def test_known_filters_get_their_numbers(suite):
 
 def test_same_seed_same_numbers_and_methods_share_their_luck(suite):
     def numbers(seed, *methods):
-        data = bench.benchmark(suite, methods, runs=3, particles=5, seed=seed)["methods"]
+        data = benchmark(suite, methods, runs=3, particles=5, seed=seed)["methods"]
         return [entry["estimates"]["cluster"] for entry in data.values()]
 
     first, again = (numbers(3, "adam_likelihood_grid", "robust_likelihood_grid") for _ in range(2))
@@ -133,18 +139,18 @@ def test_same_seed_same_numbers_and_methods_share_their_luck(suite):
 def test_filters_are_built_once_per_map_unless_they_know_the_episode(suite, monkeypatch):
     built, build = [], bench.build_filter
     monkeypatch.setattr(bench, "build_filter", lambda name, *a, **k: built.append(name) or build("mcl", *a, **k))
-    bench.benchmark(suite, ("mcl", "mixture_mcl_star"), runs=1, particles=5)
+    benchmark(suite, ("mcl", "mixture_mcl_star"), runs=1, particles=5)
     assert built == ["mcl", *["mixture_mcl_star"] * 3]
 
 
 def test_one_compilation_for_episodes_of_one_shape(suite):
-    data = bench.benchmark(suite, ("robust_likelihood_grid",), runs=2, particles=6)
+    data = benchmark(suite, ("robust_likelihood_grid",), runs=2, particles=6)
     assert data["methods"]["robust_likelihood_grid"]["compilations"] == 1
 
 
 def test_progress_names_every_drive(suite):
     seen = []
-    bench.benchmark(suite, ("mcl",), runs=1, particles=5, progress=lambda *now: seen.append(now))
+    benchmark(suite, ("mcl",), runs=1, particles=5, progress=lambda *now: seen.append(now))
     assert seen == [("mcl", 0), ("mcl", 1), ("mcl", 2)]
 
 

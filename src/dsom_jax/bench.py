@@ -112,25 +112,6 @@ class Record(NamedTuple):
 Build = Callable[[str, str, OccupancyGrid, Episode], Filter]
 
 
-def benchmark(
-    suite: Suite,
-    methods: Sequence[str],
-    runs: int = 100,
-    particles: int = 200,
-    t_cut: float = 0.6,
-    seed: int = 0,
-    progress: Advance | None = None,
-    checkpoint: Any = None,
-    weight_power: float = WEIGHT_POWER,
-) -> dict[str, Any]:
-    """The contents of ``bench.json``; ``progress(method, sequence)`` is called before each drive.
-
-    ``checkpoint`` is a network, or networks by kind, as for :func:`collect`.
-    """
-    settings = Settings(runs, particles, t_cut, seed, weight_power)
-    return summary(suite, collect(suite, methods, settings, progress, checkpoint), settings)
-
-
 def collect(
     suite: Suite, methods: Sequence[str], settings: Settings, progress: Advance | None = None, checkpoint: Any = None
 ) -> dict[str, Record]:

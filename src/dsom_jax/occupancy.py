@@ -135,16 +135,6 @@ def dilate(cells: Array, steps: int = 1) -> Array:
     return cells
 
 
-def chebyshev_distance(occupied: Array, cap: int) -> Array:
-    """(..., H, W) int32 distance in cells to the nearest occupied cell in the maximum norm, at most ``cap``."""
-    distance = jnp.where(occupied, 0, 1)
-    grown = occupied
-    for step in range(1, cap):
-        grown = dilate(grown)
-        distance = jnp.where(grown, distance, step + 1)
-    return distance.astype(jnp.int32)
-
-
 def euclidean_distance(occupied: Array, cap: int) -> Array:
     """(H, W) float32 distance in cells between cell centres to the nearest occupied one, at most ``cap``.
 

@@ -2,7 +2,7 @@
 
 from dsom_jax.simulate.drive import DriveConfig, make_synthetic
 from dsom_jax.simulate.obstacles import add_obstacles, remove_structure
-from dsom_jax.simulate.worlds import WorldConfig, make_world, make_worlds
+from dsom_jax.simulate.worlds import WorldConfig, make_world
 
 __all__ = [
     "DriveConfig",
@@ -10,6 +10,5 @@ __all__ = [
     "add_obstacles",
     "make_synthetic",
     "make_world",
-    "make_worlds",
     "remove_structure",
 ]
