@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import fftconvolve
 
 RATE = 20.0
 """Hz at which the turn rates are compared."""
@@ -74,11 +73,19 @@ def _coarse(
     if energy <= 0:
         return None
     # Not normalised by the overlap: recordings cover the same time, and a short overlap fits by chance.
-    match = fftconvolve(odometry_rate, scan_rate[::-1]) / energy
+    match = convolved(odometry_rate, scan_rate[::-1]) / energy
     offsets = times[0] - starts[0] + (np.arange(len(match)) - (len(scan_rate) - 1)) / RATE
     best = int(match.argmax())
     others = match[np.abs(offsets - offsets[best]) > 1.0]
     return None if others.size and others.max() > 0.9 * match[best] else float(offsets[best])
+
+
+def convolved(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(M + N - 1,) convolution of (M,) and (N,). ``scipy.signal`` has one, and takes seconds to import."""
+    size = len(a) + len(b) - 1
+    # Zeros up to a power of two: a transform of a prime length is slow.
+    padded = 1 << (size - 1).bit_length()
+    return np.fft.irfft(np.fft.rfft(a, padded) * np.fft.rfft(b, padded), padded)[:size]
 
 
 def _sampled(times: np.ndarray, angle: np.ndarray) -> np.ndarray:
