@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -179,11 +178,4 @@ def test_a_bag_cut_off(tmp_path: Path) -> None:
     path = write_bag(tmp_path, "bag", drive(n=50))
     path.write_bytes(path.read_bytes()[:3000])
     with pytest.raises(UserError, match="not a readable bag"):
-        load_bag(path)
-
-
-def test_without_rosbags_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = write_bag(tmp_path, "bag", drive())
-    monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
-    with pytest.raises(UserError, match=r"pip install 'dsom-jax\[bags\]'"):
         load_bag(path)

@@ -180,7 +180,7 @@ class Player:
         for heard, message in list(self.poses):
             if heard >= since:
                 pose, _ = messages.pose_of(message.pose)
-                truth, _ = self.true_at(messages.seconds(message.header.stamp))
+                truth, _ = self.true_at(messages.stamp_of(message))
                 x, y, turn = se2.relative(truth, pose)
                 found.append((math.hypot(x, y), abs(turn)))
         return found
@@ -188,7 +188,7 @@ class Player:
     def map_to_odom(self, since: float = 0.0) -> list[tuple[float, float, np.ndarray]]:
         """(heard, stamp, pose) of the transforms that the node sent."""
         return [
-            (heard, messages.seconds(t.header.stamp), np.array([
+            (heard, messages.stamp_of(t), np.array([
                 t.transform.translation.x, t.transform.translation.y,
                 2 * math.atan2(t.transform.rotation.z, t.transform.rotation.w)]))
             for heard, message in list(self.transforms)

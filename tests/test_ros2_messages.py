@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dsom_jax.data import se2
-from dsom_jax.data.tf_tree import Mount
+from dsom_jax.data.tf_tree import Mount, seconds
 from dsom_jax.errors import UserError
 from dsom_jax.ros2 import messages
 from dsom_jax.ros2.transforms import KEEP, Transforms
@@ -24,7 +24,7 @@ def test_stamps_there_and_back(at):
     messages.set_stamp(told, at)
     assert 0 <= told.nanosec < 10**9 and isinstance(told.sec, int)
     # A double holds 1.7e9 s to 0.24 microseconds.
-    assert messages.seconds(told) == pytest.approx(at, abs=5e-7)
+    assert seconds(told) == pytest.approx(at, abs=5e-7)
 
 
 def test_ranges_become_rep_117():
@@ -216,4 +216,4 @@ def test_transforms_that_are_no_numbers_are_left_out():
 
 
 def test_stamp_of_the_kit():
-    assert messages.seconds(stamp(12.5)) == 12.5
+    assert seconds(stamp(12.5)) == 12.5

@@ -20,7 +20,7 @@ from dsom_jax.data.files import check_file
 from dsom_jax.data.log import RawLog, Report
 from dsom_jax.data.log_options import AS_TOLD, LogOptions, option
 from dsom_jax.data.scans import Scans, table
-from dsom_jax.data.tf_tree import FIXED, TfTree, last_name, planar
+from dsom_jax.data.tf_tree import FIXED, TfTree, last_name, pose_row, stamp_of
 from dsom_jax.errors import UserError
 
 SCAN, ODOMETRY = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Odometry"
@@ -121,12 +121,11 @@ def load_bag(path: str | Path, options: LogOptions = AS_TOLD, range_max: float |
 
 @contextmanager
 def open_bag(path: Path) -> Iterator[Any]:
-    """Reader of any kind of bag."""
-    try:
-        from rosbags.highlevel import AnyReader
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError:
-        raise UserError(f"{path}: reading bags needs rosbags; run: pip install 'dsom-jax[bags]'") from None
+    """Reader of any kind of bag. One that says nothing of its types, as Humble's do, is taken to be of Humble."""
+    # Late, as most who import this package read no bag.
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
+
     if not path.is_dir():
         check_file(path, "bag")
     elif (path / "metadata.yaml").exists():
@@ -221,8 +220,9 @@ def _read(reader: Any, chosen: tuple[str, str | None, str | None], report: Repor
     own = [c for c in transforms if _namespace(c.topic) == _namespace(scan_topic)]
     transforms = own if len({_namespace(c.topic) for c in transforms}) > 1 and own else transforms
     wanted = [c for c in reader.connections if c.topic in chosen]
+    wanted += [c for c in transforms if c not in wanted]
     messages = Messages()
-    for topic, received, message in _messages(reader, [*wanted, *(c for c in transforms if c not in wanted)], report):
+    for topic, received, message in messages_of_topics(reader, wanted, report):
         if topic == scan_topic:
             messages.scans.append(message)
             messages.received.append(1e-9 * received)
@@ -235,7 +235,7 @@ def _read(reader: Any, chosen: tuple[str, str | None, str | None], report: Repor
     return messages
 
 
-def _messages(reader: Any, wanted: list[Any], report: Report) -> Iterator[tuple[str, int, Any]]:
+def messages_of_topics(reader: Any, wanted: list[Any], report: Report) -> Iterator[tuple[str, int, Any]]:
     """Topic, time of recording (ns) and message, as far as the bag can be read; what cannot is counted."""
     stream = reader.messages(connections=wanted)
     while True:
@@ -252,16 +252,6 @@ def _messages(reader: Any, wanted: list[Any], report: Report) -> Iterator[tuple[
             report.add(f"unreadable messages on {connection.topic}", type(error).__name__)
             continue
         yield connection.topic, received, message
-
-
-def stamp_of(message: Any) -> float:
-    """Header stamp in seconds."""
-    return message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
-
-
-def pose_row(message: Any, pose: Any) -> list[float]:
-    """(stamp, x, y, yaw) of a message with a header."""
-    return [stamp_of(message), *planar(pose.position, pose.orientation)]
 
 
 def _of_one_lidar(path: Path, messages: Messages, options: LogOptions, report: Report) -> tuple[Messages, str]:

@@ -10,7 +10,7 @@ import numpy as np
 from dsom_jax.data import se2
 from dsom_jax.data.log import Report
 from dsom_jax.data.log_options import LogOptions
-from dsom_jax.data.tf_tree import HOLD, TfTree, at_stamps, planar
+from dsom_jax.data.tf_tree import HOLD, TfTree, at_stamps, planar, pose_row, stamp_of
 from dsom_jax.errors import UserError
 
 STAMPED = "geometry_msgs/msg/PoseStamped"
@@ -75,11 +75,9 @@ def _of_topic(path: Path, messages: list[Any], drive: Any, stamps: np.ndarray, t
 
 def _row(message: Any) -> list[float]:
     """(stamp, x, y, yaw) of any message of :data:`REFERENCES`."""
-    stamp = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
     if hasattr(message, "transform"):
-        return [stamp, *planar(message.transform.translation, message.transform.rotation)]
-    pose = message.pose if message.__msgtype__ == STAMPED else message.pose.pose
-    return [stamp, *planar(pose.position, pose.orientation)]
+        return [stamp_of(message), *planar(message.transform.translation, message.transform.rotation)]
+    return pose_row(message, message.pose if message.__msgtype__ == STAMPED else message.pose.pose)
 
 
 def _of_tf(path: Path, tree: TfTree, drive: Any, stamps: np.ndarray, fixed: str) -> np.ndarray:

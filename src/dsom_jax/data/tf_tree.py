@@ -32,6 +32,28 @@ class Mount:
     tilt: float
 
 
+def mount_of(pose: np.ndarray) -> Mount:
+    """The mount that a pose (4, 4) of the laser in the base frame is, seen from above."""
+    axis = float(np.clip(pose[2, 2], -1.0, 1.0))
+    yaw = float(np.arctan2(pose[1, 0], pose[0, 0]))
+    return Mount(float(pose[0, 3]), float(pose[1, 3]), yaw, axis < 0, float(np.arccos(abs(axis))))
+
+
+def seconds(stamp: Any) -> float:
+    """builtin_interfaces/Time in seconds."""
+    return stamp.sec + 1e-9 * stamp.nanosec
+
+
+def stamp_of(message: Any) -> float:
+    """Header stamp in seconds."""
+    return seconds(message.header.stamp)
+
+
+def pose_row(message: Any, pose: Any) -> list[float]:
+    """(stamp, x, y, yaw) of a message with a header."""
+    return [stamp_of(message), *planar(pose.position, pose.orientation)]
+
+
 def planar(position: Any, orientation: Any) -> tuple[float, float, float]:
     """(x, y, yaw) of a ROS position and quaternion."""
     return position.x, position.y, float(yaw_of(np.array([orientation.x, orientation.y, orientation.z, orientation.w])))
@@ -73,8 +95,8 @@ class TfTree:
         for stamped in message.transforms:
             # tf of ROS 1 wrote a leading slash.
             edge = stamped.header.frame_id.lstrip("/"), stamped.child_frame_id.lstrip("/")
-            p, q, stamp = stamped.transform.translation, stamped.transform.rotation, stamped.header.stamp
-            row = (stamp.sec + 1e-9 * stamp.nanosec, p.x, p.y, p.z, q.x, q.y, q.z, q.w)
+            p, q = stamped.transform.translation, stamped.transform.rotation
+            row = (stamp_of(stamped), p.x, p.y, p.z, q.x, q.y, q.z, q.w)
             self.edges.setdefault(edge, array("d")).extend(row)
 
     def table(self, edge: Edge) -> np.ndarray:
@@ -161,10 +183,7 @@ class TfTree:
         common = next((frame for frame in laser_chain if frame in base_chain), None)
         if common is None:
             return None
-        pose = np.linalg.inv(base_chain[common]) @ laser_chain[common]
-        axis = float(np.clip(pose[2, 2], -1.0, 1.0))
-        yaw = float(np.arctan2(pose[1, 0], pose[0, 0]))
-        return Mount(float(pose[0, 3]), float(pose[1, 3]), yaw, axis < 0, float(np.arccos(abs(axis))))
+        return mount_of(np.linalg.inv(base_chain[common]) @ laser_chain[common])
 
     def poses_in(self, fixed: str, frame: str, stamps: np.ndarray) -> np.ndarray | None:
         """Poses (N, 3) of ``frame`` in the frame ``fixed`` at ``stamps``, NaN in gaps; None if not connected."""

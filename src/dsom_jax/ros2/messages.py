@@ -11,7 +11,7 @@ import numpy as np
 
 from dsom_jax.data.files import FAR
 from dsom_jax.data.log import limit_ranges
-from dsom_jax.data.tf_tree import Mount, planar
+from dsom_jax.data.tf_tree import Mount, planar, stamp_of
 from dsom_jax.data.trajectory import yaw_of
 from dsom_jax.errors import UserError
 from dsom_jax.lidar import LidarConfig
@@ -44,11 +44,6 @@ class Scan:
     range_max: float
 
 
-def seconds(stamp: Any) -> float:
-    """builtin_interfaces/Time in seconds."""
-    return stamp.sec + 1e-9 * stamp.nanosec
-
-
 def set_stamp(stamp: Any, at: float) -> None:
     """Write seconds, which may be negative, into a builtin_interfaces/Time."""
     nanoseconds = round(at * 1e9)
@@ -58,7 +53,7 @@ def set_stamp(stamp: Any, at: float) -> None:
 def scan_of(message: Any) -> Scan:
     """Numbers of a sensor_msgs/LaserScan."""
     return Scan(
-        seconds(message.header.stamp),
+        stamp_of(message),
         message.header.frame_id.lstrip("/"),
         np.asarray(message.ranges, np.float32),
         float(message.angle_min),

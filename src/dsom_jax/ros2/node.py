@@ -189,7 +189,7 @@ class Amcl(LifecycleNode):
         except UserError as error:
             self._say("warn", str(error))
             return
-        self.engine.hear_pose(pose, covariance, messages.seconds(message.header.stamp))
+        self.engine.hear_pose(pose, covariance, messages.stamp_of(message))
 
     def _set_initial_pose(self, request: Any, response: Any) -> Any:
         self._initial_pose(request.pose)

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dsom_jax.data.tf_tree import Mount, matrix
-from dsom_jax.ros2.messages import seconds
+from dsom_jax.data.tf_tree import Mount, matrix, mount_of, stamp_of
 
 KEEP = 10.0
 """Seconds of transforms that are kept, as tf2 does."""
@@ -36,7 +35,7 @@ class Transforms:
             if static:
                 self._fixed[child] = parent, pose
             else:
-                self._enter(parent, child, seconds(stamped.header.stamp), pose)
+                self._enter(parent, child, stamp_of(stamped), pose)
 
     def _enter(self, parent: str, child: str, stamp: float, pose: np.ndarray) -> None:
         known, poses = self._moving.get(child, (parent, deque()))
@@ -57,11 +56,7 @@ class Transforms:
     def mount(self, base: str, laser: str, stamp: float) -> Mount | None:
         """Where the laser sits on the base; None while it cannot be told."""
         pose = self._pose(base, laser, stamp)
-        if pose is None:
-            return None
-        axis = float(np.clip(pose[2, 2], -1.0, 1.0))
-        yaw = float(np.arctan2(pose[1, 0], pose[0, 0]))
-        return Mount(float(pose[0, 3]), float(pose[1, 3]), yaw, axis < 0, float(np.arccos(abs(axis))))
+        return None if pose is None else mount_of(pose)
 
     def _chain(self, frame: str) -> list[str]:
         """``frame`` and all above it."""
