@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from dsom_jax.data import se2
+from dsom_jax.data.bag import is_bag, open_bag
 from dsom_jax.data.files import read_lines
 from dsom_jax.data.log import RawLog, travelled
 from dsom_jax.occupancy import OccupancyGrid
@@ -34,11 +35,9 @@ def messages_of(path: Path) -> dict[str, int]:
     if path.is_file() and path.suffix.lower() in (".log", ".clf", ".gz"):
         words = (line.split(None, 1)[0] for line in read_lines(path, "log") if line.strip())
         return dict(Counter(word for word in words if word.isalnum() and word.isupper()).most_common())
-    if path.suffix.lower() not in (".bag", ".db3", ".mcap") and not (path / "metadata.yaml").is_file():
+    if not is_bag(path):
         return {}
-    from rosbags.highlevel import AnyReader
-
-    with AnyReader([path]) as reader:
+    with open_bag(path) as reader:
         return {f"{topic} ({about.msgtype})": about.msgcount for topic, about in sorted(reader.topics.items())}
 
 

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dsom_jax.data import se2
+from dsom_jax.data.bag import is_bag
 from dsom_jax.data.log import RawLog
 from dsom_jax.diagnosis import map_fit
 from dsom_jax.diagnosis.ego_motion import Motion, Steps, ego_motion, matched_steps, pieces_of
@@ -180,7 +181,8 @@ def of_odometry(log: RawLog, steps: Steps, motion: Motion) -> list[Finding]:
             "clock_offset", "error" if size >= 0.25 else "warning" if size >= 0.1 else "note",
             f"the turns of the scans agree best with the odometry of {size:.2f} s "
             f"{'later' if motion.lag > 0 else 'earlier'} (unexplained turning falls by {motion.lag_gain:.0%})",
-            f"add {motion.lag:+.2f} s to the stamps of the scans",
+            f"--clock-offset {motion.lag:.2f}, added to one that is given" if is_bag(log.path)
+            else f"add {motion.lag:+.2f} s to the stamps of the scans",
         ))  # fmt: skip
     return found
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dsom_jax.data import se2
+from dsom_jax.data.bag import is_bag
 from dsom_jax.data.documents import read_yaml
 from dsom_jax.data.log import RawLog, travelled
 from dsom_jax.data.ros_map import decode_image, read_map_info
@@ -87,20 +88,32 @@ def self_hits(log: RawLog) -> list[Finding]:
         return []
     beams = np.flatnonzero(own)
     far = float(np.nanmax(middle[own]))
-    runs = ", ".join(f"{run[0]}:{run[-1]}" for run in np.split(beams, np.flatnonzero(np.diff(beams) > 1) + 1)[:4])
+    runs = np.split(beams, np.flatnonzero(np.diff(beams) > 1) + 1)
+    named = ", ".join(f"{run[0]}:{run[-1]}" for run in runs[:4])
+    masks = " ".join(mask_of(log, run) for run in runs)
     return [Finding(
         "self_hits", "warning",
-        f"{len(beams)} of {ranges.shape[1]} beams ({runs}) return from the same {far:.2f} m or less in "
+        f"{len(beams)} of {ranges.shape[1]} beams ({named}) return from the same {far:.2f} m or less in "
         f"{same[own].mean():.0%} of the scans while the robot drives {travelled(log.odometry):.0f} m: its own body",
-        f"mask these beams, or drop readings below {far + 0.05:.2f} m",
+        f"--laser-mask {masks}, or --laser-min-range {far + 0.05:.2f}",
     )]  # fmt: skip
+
+
+def mask_of(log: RawLog, run: np.ndarray) -> str:
+    """FROM:TO of ``--laser-mask`` for neighbouring beams, half a beam wider on both sides."""
+    step = log.lidar.angle_increment
+    ends = np.sort(log.lidar.angle_min + step * run[[0, -1]]) + np.array([-0.5, 0.5]) * abs(step)
+    start, end = np.degrees(se2.wrap(ends))
+    return f"{start:.2f}deg:{end:.2f}deg"
 
 
 def beams_vary(log: RawLog) -> list[Finding]:
     """Scans with another number of beams, as the reader counted them."""
-    lines = [line for line in log.report.lines() if re.search(r"scans? of \d+ beams|beams? var|number of beams", line)]
-    return [Finding("beams_vary", "note", lines[0], "none needed if few; else let the driver fix its number of rays")
-            ] if lines else []  # fmt: skip
+    # The words of log.majority_beams and of scans.brought_together.
+    said = r"scans of (\d+|other) beams|scans that cover less than half"
+    lines = [line for line in log.report.lines() if re.search(said, line)]
+    fix = "none needed if few; else let the driver keep to the same rays"
+    return [Finding("beams_vary", "note", lines[0], fix)] if lines else []
 
 
 def odd_stamps(log: RawLog) -> list[Finding]:
@@ -195,7 +208,7 @@ def unknown_is_free(grid: OccupancyGrid) -> list[Finding]:
 
 def grey_is_free(path: Path) -> list[Finding]:
     """A grey of the map's image that is free by the thresholds although a lighter one is, too: map_saver's unknown."""
-    if path.suffix.lower() in (".dxf", ".dwg") or "drawing" in read_yaml(path, "map yaml"):
+    if is_bag(path) or path.suffix.lower() in (".dxf", ".dwg") or "drawing" in read_yaml(path, "map yaml"):
         return []
     info = read_map_info(path)
     if info.mode != "trinary":
