@@ -14,10 +14,14 @@ from dsom_jax.live import NOWHERE
 from dsom_jax.ros2.engine import Engine
 from dsom_jax.ros2.messages import grid_of, scan_of
 from dsom_jax.ros2.parameters import Parameters
-from ros2_kit import laser_scan, occupancy, tf, transform
+from ros2_kit import laser_scan, occupancy, pose, tf, transform
 
 OFFSET = np.array([10.0, -5.0, 1.0])
 """Pose of the odometry frame in the map, as the filter below believes it."""
+
+
+OTHER = grid_of(occupancy([[0, 0, 0]]))
+"""Another map than that of :meth:`Robot.ready`."""
 
 
 class Filter:
@@ -30,6 +34,10 @@ class Filter:
         self.update_min_d, self.update_min_a = update_min_d, update_min_a
         self.calls, self.last, self.trusted = [], NOWHERE, True
         self.made.append(self)
+        self.meanwhile()
+
+    def meanwhile(self):
+        """What happens while the filter is made, which takes its time."""
 
     def update(self, ranges, odometry, stamp):
         self.calls.append(("update", stamp, tuple(np.round(odometry, 6))))
@@ -229,15 +237,73 @@ def test_a_saved_pose(tmp_path, name):
 def test_another_map_takes_the_pose_along_unless_the_first_counts():
     robot = Robot().ready()
     robot.drive()
-    robot.engine.hear_map(grid_of(occupancy([[0, 0, 0]])))
+    robot.engine.hear_map(OTHER)
+    robot.kind.meanwhile = lambda new: [robot.move() for _ in range(20)]
     assert robot.drive() is None and len(robot.kind.made) == 2 and robot.filter.grid.shape == (1, 3)
     robot.drive()
-    assert robot.filter.calls[0][0] == "set_pose" and robot.filter.calls[0][1] == tuple(
-        np.round(se2.compose(OFFSET, np.array([0.2, 0, 0])), 6)
-    )
+    # It has driven 2.4 m in all, and is where it is: 22 of 24 steps of that while the filter was made.
+    now = np.array([2.4, 0, 0])
+    assert robot.filter.calls[0] == ("set_pose", tuple(np.round(se2.compose(OFFSET, now), 6)), tuple(now))
+    assert [call[0] for call in robot.filter.calls] == ["set_pose", "update"]
+    robot.drive()
+    assert [call[0] for call in robot.filter.calls] == ["set_pose", "update", "update"]
     first = Robot(first_map_only=True).ready()
-    first.engine.hear_map(grid_of(occupancy([[0, 0, 0]])))
+    first.engine.hear_map(OTHER)
     assert first.drive() is not None and len(first.kind.made) == 1 and "first_map_only" in first.said[-1]
+
+
+def test_the_same_map_again_changes_nothing():
+    robot = Robot().ready()
+    robot.drive()
+    robot.engine.hear_map(grid_of(occupancy([[0, 100], [0, 0]])))
+    assert robot.drive() is not None and len(robot.kind.made) == 1
+    for cells, where in (([[0, 0], [0, 0]], {}), ([[0, 0], [0, 0]], {"resolution": 0.1}),
+                         ([[0, 0], [0, 0]], {"resolution": 0.1, "origin": pose(1.0)})):  # fmt: skip
+        robot.engine.hear_map(grid_of(occupancy(cells, **where)))
+        made = len(robot.kind.made)
+        assert robot.drive() is None and len(robot.kind.made) == made + 1
+
+
+@pytest.mark.parametrize("localized", [True, False])
+def test_a_pose_told_while_another_map_is_built_is_kept(localized):
+    robot = Robot().ready()
+    robot.filter.trusted = localized
+    robot.drive()
+
+    def meanwhile(new):
+        robot.engine.hear_pose(np.array([1.0, 2.0, 0.3]), np.eye(3), float(robot.t))
+        for _ in range(20):  # longer than transforms are kept
+            robot.move()
+
+    robot.kind.meanwhile = meanwhile
+    robot.engine.hear_map(OTHER)
+    robot.drive()
+    robot.drive()
+    # Where the robot was when the pose was told: at the third step.
+    assert robot.filter.calls[0] == ("set_pose", (1.0, 2.0, 0.3), (0.3, 0.0, 0.0))
+    assert [call[0] for call in robot.filter.calls] == ["set_pose", "update"]
+
+
+def test_a_robot_that_was_lost_on_the_map_before_is_looked_for():
+    robot = Robot().ready()
+    robot.drive()
+    robot.engine.look_everywhere()
+    robot.engine.hear_map(OTHER)
+    robot.drive()
+    robot.drive()
+    assert [call[0] for call in robot.filter.calls] == ["relocalize", "update"]
+
+
+def test_a_pose_told_while_the_saved_one_is_read_is_kept(tmp_path):
+    robot = Robot(saved_pose_filepath=str(tmp_path / "bad.json"), initialize_at_saved_pose=True)
+
+    def restore(filter, path):
+        robot.engine.hear_pose(np.array([1.0, 2.0, 0.3]), np.eye(3), 0.0)
+        raise UserError("not a pose")
+
+    robot.kind.restore = restore
+    robot.ready().drive()
+    assert robot.filter.calls[0][:2] == ("set_pose", (1.0, 2.0, 0.3))
 
 
 def test_changes_reach_the_filter():

@@ -9,7 +9,7 @@ import yaml
 
 from dsom_jax.errors import UserError
 from dsom_jax.filters.settings import DRAWN, REAL
-from dsom_jax.motion import OmniMotion
+from dsom_jax.motion import OmniMotion, omni_like
 from dsom_jax.ros2 import parameters as p
 
 NAV2 = {
@@ -68,6 +68,8 @@ def test_omnidirectional_drives_and_floor_plans():
     omni, _ = p.understood({"robot_model_type": "nav2_amcl::OmniMotionModel", "alpha5": 0.1})
     motion = p.settings_of(omni).robust_motion
     assert isinstance(motion, OmniMotion) and motion.alpha5 == 0.1 and motion.alpha1 == REAL.robust_motion.alpha1
+    alike, _ = p.understood({"robot_model_type": "nav2_amcl::OmniMotionModel"})
+    assert p.settings_of(alike).robust_motion == omni_like(REAL.robust_motion)
     drawn, _ = p.understood({"map_kind": "drawn"})
     assert p.settings_of(drawn).robust == DRAWN.robust
 
@@ -113,6 +115,8 @@ def test_a_slip_of_the_pen_is_named():
     _, told = p.understood({"update_min_dd": 0.1, "qos_overrides./tf.depth": 3})
     assert [line for line in told if "update_min_dd is not known, did you mean update_min_d?" in line]
     assert not [line for line in told if "qos_overrides" in line]
+    _, told = p.understood({"map_file": "map.yaml"})  # the map is the option --map, no parameter
+    assert [line for line in told if "map_file is not known" in line]
 
 
 def test_changes_while_it_runs():

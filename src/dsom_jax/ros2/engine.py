@@ -58,11 +58,24 @@ class Counts:
 
 
 class Told(NamedTuple):
-    """An initial pose: (3,), (3, 3), and the stamp that it is of; 0 means now."""
+    """An initial pose (3,) and its covariance (3, 3).
+
+    Attributes:
+        stamp: when the robot was there; 0 means now.
+        odometry: (3,) pose of the odometry then, if that was known when the pose came.
+    """
 
     pose: np.ndarray
     covariance: np.ndarray
     stamp: float
+    odometry: np.ndarray | None = None
+
+
+class Trusted(NamedTuple):
+    """Where the odometry frame lies in the map (3,), right whatever the robot drives, and the pose's covariance."""
+
+    map_to_odom: np.ndarray
+    covariance: np.ndarray
 
 
 class Engine:
@@ -89,6 +102,7 @@ class Engine:
         self._map: OccupancyGrid | None = None
         self._grid: OccupancyGrid | None = None
         self._told: Told | None = None
+        self._resume: Trusted | None = None
         self._lost, self._forced = False, False
         self._frame = ""
         self._trusted: np.ndarray | None = None
@@ -123,7 +137,8 @@ class Engine:
     def hear_pose(self, pose: np.ndarray, covariance: np.ndarray, stamp: float) -> None:
         """Start from a pose; it is kept if nothing runs yet."""
         with self._wake:
-            self._told = Told(pose, covariance, stamp)
+            # Looked up at once: while a filter is made, transforms grow too old to be kept.
+            self._told = Told(pose, covariance, stamp, self._odometry_at(stamp) if stamp else None)
             self._wake.notify()
 
     def look_everywhere(self) -> None:
@@ -172,7 +187,7 @@ class Engine:
         with self._wake:
             taken = self._newest() if self._active else None
             grid, self._map = self._map, None
-        if grid is not None:
+        if grid is not None and not (self._grid is not None and same(grid, self._grid)):
             self._change_map(grid)
         if taken is None or self._grid is None:
             return None
@@ -191,9 +206,8 @@ class Engine:
 
     def _newest(self) -> tuple[tuple[Scan, float], np.ndarray] | None:
         """The newest scan whose odometry is known, with it; older ones are dropped, newer ones wait."""
-        frames = self.parameters.odom_frame_id, self.parameters.base_frame_id
         for back, (scan, came) in enumerate(reversed(self._scans)):
-            odometry = self.transforms.planar(*frames, scan.stamp)
+            odometry = self._odometry_at(scan.stamp)
             if odometry is not None:
                 older = len(self._scans) - back - 1
                 for _ in range(older + 1):
@@ -201,16 +215,21 @@ class Engine:
                 self.counts.dropped += older
                 return (scan, came), odometry
         if len(self._scans) == _WAITING:
+            frames = self.parameters.odom_frame_id, self.parameters.base_frame_id
             self._complain(f"no transform {frames[0]} -> {frames[1]} at the stamps of the scans")
         return None
+
+    def _odometry_at(self, stamp: float) -> np.ndarray | None:
+        """Pose (3,) of the odometry at a stamp; None while it cannot be told. Its caller locks."""
+        return self.transforms.planar(self.parameters.odom_frame_id, self.parameters.base_frame_id, stamp)
 
     def _change_map(self, grid: OccupancyGrid) -> None:
         """Another map: the filter is made anew, and goes on where it was if it knew."""
         self._grid = grid
         if self.localizer is not None:
             last = self.localizer.answer()
-            if last.localized and self._told is None:
-                self._told = Told(last.pose, last.covariance + _NAV2_COVARIANCE, 0.0)
+            if last.localized and self._trusted is not None:
+                self._resume = Trusted(self._trusted, last.covariance + _NAV2_COVARIANCE)
             self.localizer = None
             self._say("info", "another map: the filter is made anew")
 
@@ -245,9 +264,9 @@ class Engine:
         self._start()
 
     def _start(self) -> None:
-        """From the pose that was told, that was saved, or that is preset; else the filter looks everywhere."""
+        """From the pose that was told, of the map before, saved, or preset; else the filter looks everywhere."""
         with self._wake:
-            waiting = self._told is not None
+            waiting = self._told is not None or self._resume is not None
         if not waiting and self.parameters.initialize_at_saved_pose and self.parameters.saved_pose_filepath:
             try:
                 if self.localizer.restore(self.parameters.saved_pose_filepath):
@@ -257,7 +276,8 @@ class Engine:
                 self._say("warn", str(error))
         if not waiting:
             with self._wake:
-                self._told = self._preset()
+                # A pose that has come meanwhile is worth more.
+                self._told = self._told or self._preset()
 
     def _preset(self) -> Told | None:
         """The initial pose of the parameters."""
@@ -267,22 +287,30 @@ class Engine:
         return Told(np.array([p.initial_pose_x, p.initial_pose_y, p.initial_pose_yaw]), _NAV2_COVARIANCE, 0.0)
 
     def _obey(self, told: Told | None, lost: bool, forced: bool, odometry: np.ndarray) -> None:
-        """Do what was asked for since the last scan."""
+        """Do what was asked for since the last scan, and go on from the map before if nothing was."""
+        resume, self._resume = self._resume, None
         self.localizer.update_min_d = self.parameters.update_min_d
         self.localizer.update_min_a = self.parameters.update_min_a
         if lost:
             self.localizer.relocalize()
             self._trusted = None
+        elif told is None and resume is not None:
+            told = Told(se2.compose(resume.map_to_odom, odometry), resume.covariance, 0.0)
         if told is not None:
-            p = self.parameters
-            with self._wake:
-                then = self.transforms.planar(p.odom_frame_id, p.base_frame_id, told.stamp) if told.stamp else None
-            try:
-                self.localizer.set_pose(told.pose, told.covariance, odometry if then is None else then)
-            except UserError as error:
-                self._say("warn", str(error))
+            self._place(told, odometry)
         if forced:
             self.localizer.force()
+
+    def _place(self, told: Told, odometry: np.ndarray) -> None:
+        """Start from a pose that was told; ``odometry`` is that of now."""
+        then = told.odometry
+        if then is None and told.stamp:
+            with self._wake:
+                then = self._odometry_at(told.stamp)
+        try:
+            self.localizer.set_pose(told.pose, told.covariance, odometry if then is None else then)
+        except UserError as error:
+            self._say("warn", str(error))
 
     def _answer(self, scan: Scan, came: float, odometry: np.ndarray) -> Output:
         """The filter's answer to a scan."""
@@ -315,3 +343,10 @@ class Engine:
         if text != self._complained:
             self._complained = text
             self._say("warn", text)
+
+
+def same(a: OccupancyGrid, b: OccupancyGrid) -> bool:
+    """Whether two maps are equal, cell by cell: a map server sends its map again when it is activated again."""
+    if (a.shape, a.resolution) != (b.shape, b.resolution):
+        return False
+    return all(np.array_equal(getattr(a, name), getattr(b, name)) for name in ("origin", "occupied", "free"))

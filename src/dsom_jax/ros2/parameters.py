@@ -12,7 +12,7 @@ from typing import Any
 from dsom_jax.data.documents import read_yaml
 from dsom_jax.errors import UserError
 from dsom_jax.filters.settings import DRAWN, REAL, Settings
-from dsom_jax.motion import OdometryMotion, OmniMotion
+from dsom_jax.motion import OdometryMotion, omni_like
 
 _REACH = 25.0
 """Metres: nav2's ``laser_max_range`` of 100 means no limit, where this filter's grid would be too coarse."""
@@ -22,7 +22,7 @@ _ALPHA = 0.2
 
 @dataclass(frozen=True)
 class Parameters:
-    """Fields are named and preset as in nav2_amcl; ``initial_pose.x`` is ``initial_pose_x``. The last five are new.
+    """Fields are named and preset as in nav2_amcl; ``initial_pose.x`` is ``initial_pose_x``. The last four are new.
 
     Attributes:
         base_frame_id, odom_frame_id, global_frame_id: frames, with whatever prefix.
@@ -45,7 +45,6 @@ class Parameters:
         initialize_at_saved_pose: start from the pose saved there.
         saved_pose_filepath: JSON file; nothing is saved without one.
         autostart: configure and activate without a lifecycle manager.
-        map_file: map from a file in place of the topic.
         map_kind: ``scanned``, or ``drawn`` for a floor plan without furniture.
         publish_while_lost: go on sending the last map -> odom that was trusted.
         cloud_rate: times a second that ``particle_cloud`` is published.
@@ -83,7 +82,6 @@ class Parameters:
     initialize_at_saved_pose: bool = False
     saved_pose_filepath: str = ""
     autostart: bool = False
-    map_file: str = ""
     map_kind: str = "scanned"
     publish_while_lost: bool = True
     cloud_rate: float = 2.0
@@ -224,8 +222,7 @@ def motion(parameters: Parameters, kind: Settings) -> Any:
     assert isinstance(own, OdometryMotion)
     chosen = {name: value for name in _ALPHAS if (value := getattr(parameters, name)) != _ALPHA}
     if "omni" in parameters.robot_model_type.lower():
-        base = {name: own.alpha1 for name in _ALPHAS} | {"min_xy": own.min_xy, "min_theta": own.min_theta}
-        return OmniMotion(**{**base, **chosen})
+        return replace(omni_like(own), **chosen)
     chosen.pop("alpha5", None)
     return replace(own, **chosen)
 
