@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dsom_jax.data import se2
+from dsom_jax.data import se2, thin
 from dsom_jax.data.carmen import load_carmen
 from dsom_jax.data.range_codes import detect_no_return
 from dsom_jax.errors import UserError
@@ -249,3 +249,18 @@ def test_bad_logs(tmp_path: Path) -> None:
     broken.write_bytes(gzip.compress(b"FLASER" * 1000)[:20])
     with pytest.raises(UserError, match="broken gzip"):
         load_carmen(broken)
+
+
+@pytest.mark.parametrize("kind", ["FLASER", "ODOM"])
+def test_the_update_after_a_reset_of_the_odometry_is_marked(tmp_path: Path, kind: str) -> None:
+    """A robot creeps, and its odometry begins anew at scan 25: that scan is an update, however little it moved."""
+    poses = [(0.01 * n + (100.0 if n < 25 else 0.0), 0.0, 0.0) for n in range(50)]
+    lines = []
+    for n, pose in enumerate(poses):
+        if kind == "FLASER":
+            lines.append(flaser([1.0 + 0.01 * n, 2.0, 3.0, 4.0, 5.0], laser=pose, odom=pose, stamp=0.1 * n))
+        else:
+            lines += [f"ODOM {pose[0]} 0 0 0 0 0 {0.1 * n} host 0", f"LASER 3 1 2 {1 + 0.01 * n} {0.1 * n} host 0"]
+    log = load_carmen(write(tmp_path, lines))
+    np.testing.assert_array_equal(np.flatnonzero(log.broken), [25])
+    assert np.abs(np.diff(log.odometry[:, 0])).max() < 0.02 and 25 in thin(log)

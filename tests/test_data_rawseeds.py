@@ -9,7 +9,7 @@ import math
 import numpy as np
 import pytest
 
-from dsom_jax.data import LogOptions, load_log, load_rawseeds, save_tum, se2
+from dsom_jax.data import LogOptions, load_log, load_rawseeds, save_tum, se2, thin
 from dsom_jax.errors import UserError
 
 SESSION, START, BEAMS, SCANS = "Bicocca_2009-02-25b", 1235603336.3, 181, 12
@@ -269,3 +269,13 @@ def test_spoilt_sessions_are_one_line(folder, kind):
         load_log(folder / name)
     assert all(fragment in str(error.value) for fragment in fragments), error.value
     assert "\n" not in str(error.value)
+
+
+def test_the_update_after_a_reset_of_the_odometry_is_marked(tmp_path):
+    poses = path_of()
+    poses[6:] += np.array([50.0, 0.0, 0.0])
+    path = write(tmp_path, "SICK_FRONT", scan_lines(ranges_of()))
+    write(tmp_path, "ODOMETRY_XYT", odometry_lines(poses))
+    log = load_rawseeds(path)
+    np.testing.assert_array_equal(np.flatnonzero(log.broken), [6])
+    assert 6 in thin(log, 10.0, 10.0)

@@ -67,12 +67,12 @@ def load_carmen(path: str | Path, options: LogOptions = AS_TOLD, range_max: floa
     ranges = np.stack([scan for scan, kept in zip(messages.ranges, keep, strict=True) if kept])
     stamps = np.array(messages.stamps)[keep]
     config = next(c for c, kept in zip(messages.configs, keep, strict=True) if kept)
-    odometry, mount, reference = _poses(messages, keep, stamps, path)
+    odometry, broken, mount, reference = _poses(messages, keep, stamps, path)
     lidar = options.mounted(lidar_of(path, ranges, config, messages.params, mount, range_max))
     if reference is not None:
         reference = se2.compose(reference, se2.inverse(np.array(lidar.mount)))
     ranges = limit_ranges(ranges, lidar.range_min, lidar.range_max)
-    return tidy(RawLog(ranges, odometry, stamps, lidar, reference, messages.report, path))
+    return tidy(RawLog(ranges, odometry, stamps, lidar, reference, messages.report, path, broken))
 
 
 def parse(lines: list[str]) -> Messages:
@@ -143,8 +143,9 @@ def _config(words: list[str]) -> LaserConfig:
 
 def _poses(
     messages: Messages, keep: np.ndarray, stamps: np.ndarray, path: Path
-) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
-    """Odometry (N, 3) at the scans, the mount (3,) if the log tells it, and the corrected poses of the laser (N, 3)."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, np.ndarray | None]:
+    """Odometry (N, 3) at the scans and where it jumped (N,), the mount (3,) if the log tells it, and the corrected
+    poses of the laser (N, 3)."""
     poses = np.array(messages.poses)[keep]
     if np.isfinite(poses).all():
         laser, odometry = poses[:, :3], poses[:, 3:]
@@ -152,16 +153,16 @@ def _poses(
             kind = "scans whose pose of the laser is that of the odometry, word for word"
             messages.report.add(f"{kind}: if a SLAM program wrote the log, the odometry is corrected", count=len(poses))
         mount = rigid_mount(odometry, laser)
-        return _without_jumps(odometry, stamps, messages.report), mount, laser if mount is None else None
+        return *_without_jumps(odometry, stamps, messages.report), mount, laser if mount is None else None
     if len(messages.odometry) < 2:
         fix = "record FLASER or ODOM lines too, or make odometry from the scans"
         raise UserError(f"{path}: neither its laser messages nor ODOM lines give odometry; {fix}")
-    return odometry_at(np.array(messages.odometry), stamps, messages.report), None, None
+    return *odometry_at(np.array(messages.odometry), stamps, messages.report), None, None
 
 
-def _without_jumps(odometry: np.ndarray, stamps: np.ndarray, report: Report) -> np.ndarray:
-    """Odometry (N, 3) of the scans as it is, or if it jumps, with no motion across the jumps."""
+def _without_jumps(odometry: np.ndarray, stamps: np.ndarray, report: Report) -> tuple[np.ndarray, np.ndarray]:
+    """Odometry (N, 3) of the scans as it is, or if it jumps, with no motion across the jumps; and where (N,) it did."""
     rows = mended(np.column_stack([stamps, odometry]), report)
     if not len(rows.breaks) and len(rows.rows) == len(np.unique(stamps)):
-        return odometry
-    return se2.interpolate(rows.rows[:, 0], rows.rows[:, 1:], stamps)
+        return odometry, np.zeros(len(stamps), bool)
+    return se2.interpolate(rows.rows[:, 0], rows.rows[:, 1:], stamps), rows.broken(stamps)

@@ -123,12 +123,13 @@ def _joined(rows: np.ndarray, jumps: np.ndarray) -> np.ndarray:
     return np.column_stack([rows[:, 0], np.concatenate(joined)])
 
 
-def odometry_at(rows: np.ndarray, stamps: np.ndarray, report: Report) -> np.ndarray:
-    """Poses (N, 3) at ``stamps`` (N,) from rows (M, 4) as they were recorded; NaN where they do not tell."""
+def odometry_at(rows: np.ndarray, stamps: np.ndarray, report: Report) -> tuple[np.ndarray, np.ndarray]:
+    """Poses (N, 3) at ``stamps`` (N,) from rows (M, 4) as they were recorded, NaN where they do not tell; and where
+    they jumped (N,), as :meth:`Odometry.broken` says."""
     odometry = mended(rows, report)
     poses = odometry.at(stamps)
     report_uncovered(odometry, stamps, poses, report)
-    return poses
+    return poses, odometry.broken(stamps)
 
 
 def report_uncovered(odometry: Odometry, stamps: np.ndarray, poses: np.ndarray, report: Report) -> None:

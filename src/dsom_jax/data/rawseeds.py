@@ -62,10 +62,10 @@ def load_rawseeds(path: str | Path, options: LogOptions = AS_TOLD, range_max: fl
     pose = np.array(MOUNTS[laser.split(".")[0].upper()], float)
     lidar = options.mounted(lidar_of(path, ranges, config, {}, pose, range_max))
     odometry = _rows(_sibling(path, session, ODOMETRY), 7, (0, 4, 5, 6), report)
-    poses = odometry_at(facing_forward(odometry, report), stamps, report)
+    poses, broken = odometry_at(facing_forward(odometry, report), stamps, report)
     reference = _reference(path, session, stamps, report)
     ranges = limit_ranges(ranges, lidar.range_min, lidar.range_max)
-    return tidy(RawLog(ranges, poses, stamps, lidar, reference, report, path))
+    return tidy(RawLog(ranges, poses, stamps, lidar, reference, report, path, broken))
 
 
 def _scan_files(folder: Path) -> Iterator[Path]:
