@@ -225,7 +225,7 @@ def test_a_pose_that_is_told_is_believed(robot, episode, odometry):
     np.testing.assert_allclose((weights[:, None] * poses).sum(0)[:2], truth[:2], atol=4 * 0.05 / math.sqrt(60))
     answers = follow(robot, episode, odometry)
     assert max(off(a.pose, pose)[0] for a, pose in zip(answers, episode.poses, strict=True)) < 0.15
-    assert answers[-1].localized
+    assert all(a.localized and len(a.hypotheses) == 1 for a in answers)
 
 
 def test_a_wrong_pose_is_corrected_by_the_scans(robot, episode, odometry):
@@ -235,7 +235,6 @@ def test_a_wrong_pose_is_corrected_by_the_scans(robot, episode, odometry):
     first = robot.update(np.full(32, np.nan), odometry[2], 102.0)
     assert off(first.pose, wrong)[0] < 0.6
     answers = follow(robot, episode, odometry, range(3, STEPS))
-    answers += follow(robot, episode, odometry[::-1], range(0), start=200)
     assert off(answers[-1].pose, episode.poses[-1])[0] < 0.3
 
 
@@ -272,7 +271,7 @@ def test_a_pose_survives_a_restart(robot, made, episode, odometry, tmp_path):
     # The odometry begins anew; the room has no two places alike, but one scan would not tell as surely.
     later = np.stack([se2.relative(odometry[7], pose) for pose in odometry])
     answer = again.update(np.asarray(episode.ranges[7]), later[7], 5000.0)
-    assert off(answer.pose, episode.poses[7])[0] < 0.15
+    assert off(answer.pose, episode.poses[7])[0] < 0.15 and answer.localized
 
 
 def test_a_pose_that_was_not_trusted_is_not_restored(robot, tmp_path):

@@ -19,6 +19,7 @@ from dsom_jax.geometry import compose
 
 CLEAN = Signs(*[jnp.float32(0.0)] * len(Signs._fields))
 
+
 def test_places_are_counted():
     rng = np.random.default_rng(0)
     centres, counts = np.array([[0, 0, 3.1], [8, 0, -1.0], [0, 9, 1.0]]), (120, 60, 20)
@@ -52,7 +53,7 @@ def watched(offset: float, sign: float = 1.0):
     watcher = monitor(tiny_world.tables(), tiny_world.LIDAR)
     episode = tiny_world.drive(10)
     answers = jnp.asarray(np.asarray(episode.poses) + np.array([0, 0, offset]), jnp.float32)
-    track = watcher.start()
+    track = watcher.start(jnp.zeros(3))
     step = jax.jit(watcher.watch)
     for t in range(10):
         odometry = episode.odometry[t] * jnp.array([sign, sign, 1.0])
@@ -84,7 +85,13 @@ def test_a_jump_is_no_step():
     episode = tiny_world.drive(3)
     zero = jnp.float32(0.0)
     track, _ = watcher.watch(
-        watcher.start(), episode.poses[0], episode.ranges[0], episode.odometry[0], jnp.bool_(True), zero, zero
+        watcher.start(jnp.zeros(3)),
+        episode.poses[0],
+        episode.ranges[0],
+        episode.odometry[0],
+        jnp.bool_(True),
+        zero,
+        zero,
     )
     away = compose(episode.poses[1], jnp.array([3.0, 0.0, 0.0]))
     track, signs = watcher.watch(track, away, episode.ranges[1], episode.odometry[1], jnp.bool_(False), zero, zero)

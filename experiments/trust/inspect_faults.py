@@ -18,6 +18,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import tyro
+from spoilers import Spoiler, increment_times, mirrored, ranges_times, turned, upside_down
 
 from dsom_jax.data import RawLog, load_log, load_map, se2
 from dsom_jax.data.log import select
@@ -54,43 +55,9 @@ class Args:
     """Run inputs again whose rows exist."""
 
 
-def turned(degrees: float) -> Spoil:
-    """The log says that the lidar is turned by so much more than it is."""
-
-    def spoil(log: RawLog, grid: OccupancyGrid, _: Path) -> Spoilt:
-        x, y, yaw = log.lidar.mount
-        return replace(log, lidar=replace(log.lidar, mount=(x, y, yaw - np.radians(degrees)))), grid
-
-    return spoil
-
-
-def mirrored(log: RawLog, grid: OccupancyGrid, _: Path) -> Spoilt:
-    """The driver counts its beams the other way round."""
-    return replace(log, ranges=log.ranges[:, ::-1]), grid
-
-
-def upside_down(log: RawLog, grid: OccupancyGrid, _: Path) -> Spoilt:
-    """The log says that the lidar hangs head down, and it does not."""
-    return replace(log, lidar=replace(log.lidar, upside_down=not log.lidar.upside_down)), grid
-
-
-def ranges_times(factor: float) -> Spoil:
-    """Readings in the wrong unit."""
-
-    def spoil(log: RawLog, grid: OccupancyGrid, _: Path) -> Spoilt:
-        lidar = replace(log.lidar, range_max=log.lidar.range_max * factor)
-        return replace(log, ranges=log.ranges * np.float32(factor), lidar=lidar), grid
-
-    return spoil
-
-
-def increment_times(factor: float) -> Spoil:
-    """An angle between beams that is wrong; the first beam is right."""
-
-    def spoil(log: RawLog, grid: OccupancyGrid, _: Path) -> Spoilt:
-        return replace(log, lidar=replace(log.lidar, angle_increment=log.lidar.angle_increment * factor)), grid
-
-    return spoil
+def of_log(spoiler: Spoiler) -> Spoil:
+    """A spoiler of logs that leaves the map as it is."""
+    return lambda log, grid, _: (spoiler(log), grid)
 
 
 def odometry_times(*factors: float) -> Spoil:
@@ -175,15 +142,15 @@ def grey_is_free(log: RawLog, grid: OccupancyGrid, _: Path) -> Spoilt:
 
 
 FAULTS: dict[str, tuple[Spoil, str]] = {
-    "turned 180 deg": (turned(180), "scan_turned"),
-    "turned 90 deg": (turned(90), "scan_turned"),
-    "turned 10 deg": (turned(10), "scan_turned"),
-    "mirrored": (mirrored, "scan_mirrored"),
-    "upside down": (upside_down, "upside_down"),
-    "ranges x 0.9": (ranges_times(0.9), "ranges_scaled"),
-    "ranges x 1.1": (ranges_times(1.1), "ranges_scaled"),
-    "angle_increment x 1.03": (increment_times(1.03), "angle_increment"),
-    "angle_increment x 0.97": (increment_times(0.97), "angle_increment"),
+    "turned 180 deg": (of_log(turned(180)), "scan_turned"),
+    "turned 90 deg": (of_log(turned(90)), "scan_turned"),
+    "turned 10 deg": (of_log(turned(10)), "scan_turned"),
+    "mirrored": (of_log(mirrored), "scan_mirrored"),
+    "upside down": (of_log(upside_down), "upside_down"),
+    "ranges x 0.9": (of_log(ranges_times(0.9)), "ranges_scaled"),
+    "ranges x 1.1": (of_log(ranges_times(1.1)), "ranges_scaled"),
+    "angle_increment x 1.03": (of_log(increment_times(1.03)), "angle_increment"),
+    "angle_increment x 0.97": (of_log(increment_times(0.97)), "angle_increment"),
     "odometry's yaw negated": (odometry_times(1, 1, -1), "odometry_yaw_sign"),
     "odometry mirrored": (odometry_times(1, -1, -1), "odometry_yaw_sign"),
     "odometry x 0.8": (odometry_times(0.8, 0.8, 1), "odometry_scaled"),

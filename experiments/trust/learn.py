@@ -102,8 +102,6 @@ def collect(args: Args, settings: Settings = SIMULATED) -> Seen:
         signs, wrong = localize(case, args.seed, number, args.runs, settings)
         rows.append((signs, wrong, np.full(len(wrong), number), np.full(len(wrong), case.fault)))
         print(f"{number:4} {case.fault:14} wrong {wrong.mean():.2f}", flush=True)
-        if args.keep:
-            np.savez_compressed(args.keep, **Seen(*(np.concatenate(c) for c in zip(*rows, strict=True)))._asdict())
     return Seen(*(np.concatenate(column) for column in zip(*rows, strict=True)))
 
 

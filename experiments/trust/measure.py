@@ -3,7 +3,8 @@
     python experiments/trust/measure.py --only clean half wrong --runs 10
 
 Every case is localized with a verdict (``adam_robust`` on the belief over the grid, 500 particles, 8 segments of 60
-updates); rows go to ``results.json``, one for each case, and are retained when the series goes on.
+updates); rows go to ``results.json``, one for each case, and are retained when the series goes on. The row ``all`` says
+how good ``p_lost`` is over every answer of every case, and over those of real logs alone.
 """
 
 from __future__ import annotations
@@ -11,24 +12,36 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from spoilers import (
+    Spoiler,
+    crowd,
+    glass,
+    increment_times,
+    mirrored,
+    other_way,
+    ranges_times,
+    turned,
+    upside_down,
+)
 from worlds import LIDARS, building, fourfold, twofold
 
 from dsom_jax.belief.verdict import Verdict
 from dsom_jax.cli import parse
-from dsom_jax.data import RawLog, load_log, load_map, se2
+from dsom_jax.data import RawLog, load_log, load_map
 from dsom_jax.data.cut import segment_indices, splice, to_episode, without_repeats
 from dsom_jax.data.log import limited
 from dsom_jax.episode import Episode
 from dsom_jax.errors import run_cli
 from dsom_jax.filters.methods import make_filter, make_proposal, watch
 from dsom_jax.filters.settings import DRAWN, REAL, Settings
-from dsom_jax.judging.metrics import ANGLE, POSITION, pose_error
+from dsom_jax.judging.metrics import ANGLE, HOLD, POSITION, first_streak, pose_error
+from dsom_jax.judging.trust import auroc, ece
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.montecarlo import run, run_keys
 from dsom_jax.occupancy import OccupancyGrid, cell_index, lookup
@@ -36,7 +49,6 @@ from dsom_jax.report import write_json
 from dsom_jax.simulate.drive import DriveConfig, make_synthetic
 
 HERE = Path(__file__).parent
-Spoil = Callable[[RawLog, np.random.Generator], RawLog]
 
 
 @dataclass(frozen=True)
@@ -57,6 +69,25 @@ class Args:
     """Measure again what has a row."""
 
 
+class Words:
+    """``p_lost`` and whether the answer was wrong, of every answer, in a file beside the rows."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.said = dict(np.load(path)) if path.exists() else {}
+
+    def add(self, name: str, said: np.ndarray) -> dict[str, Any]:
+        """Keep those of a case (n, 2), and say how good they are over all cases."""
+        self.said[name] = said.astype(np.float16)
+        np.savez_compressed(self.path, **self.said)
+        return {
+            scope: {"auroc": auroc(p, wrong > 0), "ece": ece(p, wrong > 0), "answers": len(p)}
+            for scope, names in (("everything", self.said), ("real", [n for n in self.said if "symmetric" not in n]))
+            if names
+            for p, wrong in [np.concatenate([self.said[n] for n in names]).astype(np.float64).T]
+        }
+
+
 class Case(NamedTuple):
     """What a filter believes in, and the drives."""
 
@@ -68,69 +99,16 @@ class Case(NamedTuple):
     settings: Settings
 
 
-def turned(degrees: float) -> Spoil:
-    """A lidar that is turned by so much less than its driver says."""
-
-    def spoil(log: RawLog, rng: np.random.Generator) -> RawLog:
-        x, y, yaw = log.lidar.mount
-        return replace(log, lidar=replace(log.lidar, mount=(x, y, yaw - np.radians(degrees))))
-
-    return spoil
-
-
-def scaled(factor: float) -> Spoil:
-    """Ranges in another unit."""
-    return lambda log, rng: replace(log, ranges=log.ranges * np.float32(factor))
-
-
-def hidden(share: float, width: float, fill: Callable[..., np.ndarray]) -> Spoil:
-    """Sectors of ``width`` radians, ``share`` of all, in which ``fill(rng, ranges, number)`` is read."""
-
-    def spoil(log: RawLog, rng: np.random.Generator) -> RawLog:
-        shape, beams = log.ranges.shape, max(1, round(width / abs(log.lidar.angle_increment)))
-        count = -(-shape[1] // beams)
-        drawn = np.where(rng.random((shape[0], count)) < share, rng.uniform(0.01, 1, (shape[0], count)), 0.0)
-        drawn = np.repeat(drawn, beams, 1)[:, : shape[1]]
-        return replace(log, ranges=np.where(drawn > 0, fill(rng, log.ranges, drawn), log.ranges).astype(np.float32))
-
-    return spoil
-
-
-def people(rng: np.random.Generator, ranges: np.ndarray, number: np.ndarray) -> np.ndarray:
-    """Somebody at 0.5 to 3 m."""
-    before = 0.5 + 2.5 * number + rng.normal(0, 0.05, ranges.shape)
-    return np.minimum(np.where(np.isnan(ranges), np.inf, ranges), before)
-
-
-def panes(rng: np.random.Generator, ranges: np.ndarray, number: np.ndarray) -> np.ndarray:
-    """Half of it returns from behind the glass, half not at all."""
-    return np.where(rng.random(ranges.shape) < 0.5, np.inf, ranges + 3 * number)
-
-
-def other_way(log: RawLog, rng: np.random.Generator) -> RawLog:
-    """Odometry whose yaw has the wrong sign."""
-    poses = [log.odometry[0]]
-    for step in se2.relative(log.odometry[:-1], log.odometry[1:]) * (1, 1, -1):
-        poses.append(se2.compose(poses[-1], step))
-    return replace(log, odometry=np.array(poses))
-
-
-def widened(factor: float) -> Spoil:
-    """An angle between the beams that is wrong."""
-    return lambda log, rng: replace(
-        log, lidar=replace(log.lidar, angle_increment=log.lidar.angle_increment * factor)
-    )
-
-
-FAULTS: dict[str, Spoil] = {
+FAULTS: dict[str, Spoiler] = {
     "turned 180": turned(180),
     "turned 90": turned(90),
     "turned 10": turned(10),
-    "mirrored": lambda log, rng: replace(log, ranges=log.ranges[:, ::-1].copy()),
-    "upside down": lambda log, rng: replace(log, lidar=replace(log.lidar, upside_down=True)),
-    "ranges 0.9": scaled(0.9),
-    "ranges 1.1": scaled(1.1),
-    "increment 0.97": widened(0.97),
+    "mirrored": mirrored,
+    "upside down": upside_down,
+    "ranges 0.9": ranges_times(0.9),
+    "ranges 1.1": ranges_times(1.1),
+    "increment 0.97": increment_times(0.97),
+    "increment 1.03": increment_times(1.03),
     "yaw sign": other_way,
 }
 
@@ -139,12 +117,15 @@ def main() -> None:
     """Command line."""
     args = parse(Args, "python experiments/trust/measure.py")
     rows = json.loads(args.out.read_text()) if args.out.exists() else {}
+    words = Words(args.out.with_suffix(".npz"))
     for case in every(args):
         name = f"{case.group}: {case.name}"
         if (args.only and case.group not in args.only) or (name in rows and not args.force):
             continue
         began = time.perf_counter()
-        rows[name] = measure(case, args.runs) | {"runs": args.runs}
+        row, said = measure(case, args.runs)
+        rows[name] = row | {"runs": args.runs}
+        rows["all"] = words.add(name, said)
         print(f"{name:44}", {k: v for k, v in rows[name].items() if v is not None},
               f"{time.perf_counter() - began:.0f} s", flush=True)  # fmt: skip
         write_json(args.out, rows)
@@ -152,12 +133,13 @@ def main() -> None:
 
 def every(args: Args) -> Iterator[Case]:
     """All cases, logs read when their turn comes."""
-    rng = np.random.default_rng(0)
 
-    def case(group: str, name: str, place: str, source: str, spoil: Spoil | None = None, kidnap: bool = False) -> Case:
+    def case(
+        group: str, name: str, place: str, source: str, spoil: Spoiler | None = None, kidnap: bool = False
+    ) -> Case:
         folder = args.data / source
         log = limited(load_log(folder / "log.clf.gz", reference=folder / "reference.tum"), 25.0)
-        log = spoil(log, rng) if spoil else log
+        log = spoil(log) if spoil else log
         settings = DRAWN if "plan" in place or "walls" in place else REAL
         episodes = cut(log, args.segments, kidnap)
         return Case(group, name, load_map(map_of(args.data, place)), log.lidar, episodes, settings)
@@ -180,9 +162,9 @@ def every(args: Args) -> Iterator[Case]:
         yield from (case("fault", f"{log} {name}", log, log, f) for log in logs[:2] for name, f in FAULTS.items())
     if "crowd" in wanted:
         for share in (0.4, 0.6):
-            yield from (case("crowd", f"{log} {share}", log, log, hidden(share, 0.26, people)) for log in logs[:2])
+            yield from (case("crowd", f"{log} {share}", log, log, crowd(share)) for log in logs[:2])
     if "glass" in wanted:
-        yield from (case("glass", log, log, log, hidden(0.5, 0.09, panes)) for log in logs[:2])
+        yield from (case("glass", log, log, log, glass(0.5)) for log in logs[:2])
     if "symmetric" in wanted:
         yield from (symmetric(seed) for seed in range(10))
 
@@ -212,14 +194,15 @@ def symmetric(seed: int) -> Case:
     return Case("symmetric", f"{name} {seed}", grid, lidar, [episode], SIMULATED)
 
 
-def measure(case: Case, runs: int) -> dict[str, Any]:
-    """The row of a case."""
+def measure(case: Case, runs: int) -> tuple[dict[str, Any], np.ndarray]:
+    """The row of a case, and ``p_lost`` beside whether the answer was wrong (n, 2)."""
     proposal = make_proposal("likelihood_grid", case.grid, case.lidar, case.settings)
     filter = make_filter("adam_robust", proposal, case.grid, case.lidar, case.settings)
     filter = watch(filter, case.grid, case.lidar, case.settings)
     judged = [judge(case, n, run(filter, e, run_keys(0, n, runs)).info, e) for n, e in enumerate(case.episodes)]
     pooled = {name: [part for j in judged if (part := j[name]) is not None] for name in judged[0]}
-    return {name: round(float(np.mean(np.concatenate(v))), 4) if v else None for name, v in pooled.items()}
+    said = np.stack([np.concatenate(pooled.pop("p_lost")), np.concatenate(pooled["wrong"])], -1)
+    return {name: round(float(np.mean(np.concatenate(v))), 4) if v else None for name, v in pooled.items()}, said
 
 
 def judge(case: Case, number: int, info: Any, episode: Episode) -> dict[str, np.ndarray | None]:
@@ -230,7 +213,8 @@ def judge(case: Case, number: int, info: Any, episode: Episode) -> dict[str, np.
     sure = verdict == Verdict.LOCALIZED
     known = ~np.isnan(e_pos)
     first = np.where(sure.any(1), sure.argmax(1), sure.shape[1]).astype(float)
-    found = (~wrong).argmax(1)[:, None] + 5 <= np.arange(sure.shape[1])
+    converged = first_streak(~wrong, known, HOLD)[1]
+    found = (converged >= 0)[:, None] & (np.arange(sure.shape[1]) > converged[:, None])
     i, j = cell_index(case.grid, episode.poses)
     free = np.broadcast_to(np.asarray(lookup(case.grid.free, i, j, outside=False)), sure.shape)
     moved = np.flatnonzero(np.asarray(episode.kidnapped))
@@ -247,6 +231,7 @@ def judge(case: Case, number: int, info: Any, episode: Episode) -> dict[str, np.
         "first_localized": first,
         "certain_when_found": sure[known & found],
         "certain_on_map": sure[known & free],
+        "p_lost": p[known],
         "p_lost_wrong": p[known & wrong] if (known & wrong).any() else None,
         "p_lost_right": p[known & ~wrong] if (known & ~wrong).any() else None,
         "left_in_2": np.concatenate(left) if left else None,

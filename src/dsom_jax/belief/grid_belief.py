@@ -179,7 +179,8 @@ class GridBelief:
         first = inputs.index == 0
         told = jnp.where(jnp.isfinite(inputs.odometry).all() & ~first, inputs.odometry, 0.0)
         odometry = compose(memory.pending, told)
-        fresh = jnp.where(first, 1.0, novelty(memory.scan, inputs.ranges, odometry))
+        unseen = jnp.isnan(memory.scan).all()  # as after a pose that was told
+        fresh = jnp.where(first | unseen, 1.0, novelty(memory.scan, inputs.ranges, odometry))
         counts = fresh > _NEWS
         rows, fits = self._reachable(memory, odometry)
         near = memory.focused & fits & ~first

@@ -42,12 +42,14 @@ class Fit(NamedTuple):
 def fit(ranges: Array, expected: Array, seen: Array, range_max: float) -> Fit:
     """Fit of a scan (..., B) to the expected ranges and to the ranges at which known space ends (..., B).
 
-    Neighbouring beams lend their expected ranges: at an edge either wall will do. A beam without return where no
-    wall is expected says nothing.
+    Neighbouring beams lend their expected ranges: at an edge either wall will do; the first and the last beam have one
+    neighbour each. A beam without return where no wall is expected says nothing.
     """
     cut = lambda r: jnp.minimum(r, range_max)  # noqa: E731
     z, wall, edge = cut(ranges), cut(expected), cut(seen)
-    around = jnp.stack([jnp.roll(wall, 1, -1), wall, jnp.roll(wall, -1, -1)])
+    before = jnp.concatenate([wall[..., :1], wall[..., :-1]], -1)
+    after = jnp.concatenate([wall[..., 1:], wall[..., -1:]], -1)
+    around = jnp.stack([before, wall, after])
     nearest, farthest = around.min(0), around.max(0)
     valid = ranges > -jnp.inf
     unknown = valid & (edge < jnp.minimum(z, nearest) - _TOLERANCE)
@@ -144,10 +146,10 @@ class Monitor:
     fade: float = field(default=0.7, metadata={"static": True})
     slow: float = field(default=0.9, metadata={"static": True})
 
-    def start(self) -> Track:
-        """Nothing seen."""
+    def start(self, pose: Array) -> Track:
+        """Nothing seen; ``pose`` (3,) is where the odometry of the next update begins, if it is not the first."""
         zero = jnp.float32(0.0)
-        return Track(jnp.zeros(3), jnp.zeros(5), *[zero] * 10)
+        return Track(pose, jnp.zeros(5), *[zero] * 10)
 
     def watch(
         self,
@@ -173,19 +175,21 @@ class Monitor:
         return track, self._signs(track, now, elsewhere, scattered)
 
     def _stepped(self, track: Track, answer: Array, odometry: Array, first: Array) -> Track:
-        """Reported against answered step; both along the mean heading, so that a wrong turn is not a wrong way."""
+        """Reported against answered step; both along the mean heading, so that a wrong turn is not a wrong way.
+
+        ``odometry`` is finite, as :func:`dsom_jax.montecarlo.update` gives it.
+        """
         step = relative(track.pose, answer)
         gap = wrap_angle(step[2] - odometry[2])
         c, s = jnp.cos(gap / 2), jnp.sin(gap / 2)
         x, y = c * step[0] + s * step[1], c * step[1] - s * step[0]
-        told = jnp.where(jnp.isfinite(odometry), odometry, 0.0)
-        travel = jnp.hypot(told[0], told[1])
-        backward = told[0] * x + told[1] * y < -0.5 * travel**2
-        told = jnp.where(backward, -1.0, 1.0) * told
+        travel = jnp.hypot(odometry[0], odometry[1])
+        backward = odometry[0] * x + odometry[1] * y < -0.5 * travel**2
+        told = jnp.where(backward, -1.0, 1.0) * odometry
         off = jnp.hypot(x - told[0], y - told[1])
         jumped = (off > jnp.maximum(1.0, 1.5 * travel)) | (jnp.abs(gap) > 0.7)
         keep = jnp.where(first, 0.0, self.slow)
-        use = jnp.where(first | jumped | ~jnp.isfinite(odometry).all(), 0.0, 1.0)
+        use = jnp.where(first | jumped, 0.0, 1.0)
         long = jnp.where(first, 0.0, _MINUTES)
         return track._replace(
             cross=keep * track.cross + use * (told[0] * y - told[1] * x),

@@ -89,7 +89,7 @@ class Watched:
 
     def init(self, key: Key) -> WatchedState:
         """Nothing known."""
-        return WatchedState(self.filter.init(key), self.monitor.start(), jnp.int8(Verdict.LOST))
+        return WatchedState(self.filter.init(key), self.monitor.start(jnp.zeros(3)), jnp.int8(Verdict.LOST))
 
     def around(self, key: Key, pose: Array, covariance: Array) -> tuple[Any, WatchedState, Array]:
         """Memory and state after a start from a pose (3,) with a covariance (3, 3), and the share of it that is free.
@@ -100,7 +100,7 @@ class Watched:
             raise TypeError(f"{type(self.filter).__name__} cannot start from a pose; use AdaM robust")
         own, state, free = self.filter.around(key, pose, covariance)
         memory = own, () if self.drawn else self.belief.around(pose, covariance)
-        return memory, WatchedState(state, self.monitor.start(), jnp.int8(Verdict.LOCALIZED)), free
+        return memory, WatchedState(state, self.monitor.start(pose), jnp.int8(Verdict.LOCALIZED)), free
 
     def step(self, key: Key, state: WatchedState, inputs: Inputs, prepared: Shared) -> tuple[WatchedState, WatchedInfo]:
         """One update of the filter, and what to make of it."""

@@ -209,7 +209,9 @@ def watch(
     own: Any = getattr(filter, "proposal", None)
     drawn = isinstance(own, GridBelief)
     usable = isinstance(own, LikelihoodGrid | GridBelief)
-    made = own if usable else make_proposal("likelihood_grid", grid, lidar, settings)
+    # Hybrid and markov_* hold one made with the same settings.
+    held = own if usable else getattr(own, "likelihood", None)
+    made = make_proposal("likelihood_grid", grid, lidar, settings) if held is None else held
     belief: Any = made if drawn else grid_belief(made, grid, settings.belief)  # type: ignore[arg-type]
     tables = make_tables(grid, settings.robust_raycast, lidar.range_max)
     return Watched(filter, belief, monitor(tables, lidar), drawn, head, estimate)

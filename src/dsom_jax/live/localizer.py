@@ -200,7 +200,8 @@ class Localizer:
     def set_pose(self, pose: Sequence[float] | np.ndarray, covariance: Any, odometry_pose: Any = None) -> None:
         """Start again from a pose (3,) in the map frame with a covariance (3, 3), and that of the odometry there.
 
-        Without ``odometry_pose`` it is the last one that came with a scan.
+        Without ``odometry_pose`` it is the last one that came with a scan. The pose is taken at its word until the next
+        scan, which is used even if the robot stands still.
 
         Raises:
             UserError: nothing of it lies on free space, or it is not finite.

@@ -42,7 +42,8 @@ def one_update(
 def around(filter: Any, keys: Key, pose: Array, covariance: Array) -> tuple[Any, Any, Array]:
     """Memory and states (1, ...) about a pose, and the share of it that lies on free space."""
     place = partial(filter.around, pose=pose, covariance=covariance)
-    memory, states, free = jax.vmap(place, out_axes=(None, 0, 0))(keys)
+    first = jax.vmap(lambda key: jax.random.fold_in(key, 0))(keys)  # later updates fold in their own numbers
+    memory, states, free = jax.vmap(place, out_axes=(None, 0, 0))(first)
     return memory, states, free[0]
 
 
