@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from dsom_jax.data import se2
 from dsom_jax.data.log import select
 from dsom_jax.diagnosis import map_fit
 from dsom_jax.diagnosis.ego_motion import Motion, ego_motion, matched_steps, pieces_of
-from dsom_jax.diagnosis.explain import MapAnswer, explain, handedness, of_map, scales, yaw
+from dsom_jax.diagnosis.explain import MapAnswer, explain, handedness, of_map, of_odometry, scales, yaw
 from dsom_jax.diagnosis.findings import CODES, Finding, ordered
 from dsom_jax.diagnosis.map_fit import Geometry, MapField, Scans
 from dsom_jax.diagnosis.matching import Reference, bearings, match, points_of, transform
@@ -219,6 +220,16 @@ def test_a_mirrored_scan_turns_the_other_way():
     (found,) = yaw(LOG, replace(MOTION, yaw=0.5), mirrored=True, slack=0.0)
     assert "mount: [0, 0, -0.5000]" in found.fix
     assert yaw(LOG, replace(MOTION, yaw=0.04), mirrored=False, slack=0.0) == []
+
+
+@pytest.mark.parametrize(
+    ("log", "fix"),
+    [("drive.bag", "--clock-offset -0.30, added to one that is given"),
+     ("drive.log", "add -0.30 s to the stamps of the scans")],
+)  # fmt: skip
+def test_the_fix_of_a_clock_is_an_option_where_there_is_one(steps, log, fix):
+    (found,) = of_odometry(replace(LOG, path=Path(log)), steps, replace(MOTION, lag=-0.3, lag_gain=0.5))
+    assert (found.code, found.fix) == ("clock_offset", fix)
 
 
 @pytest.mark.parametrize(("held", "codes"), [(0.0, ["wrong_map"]), (0.5, [])])

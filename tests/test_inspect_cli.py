@@ -11,12 +11,16 @@ import pytest
 
 import inspect_kit as kit
 from dsom_jax import inspect
-from dsom_jax.data import save_ros_map
-from dsom_jax.data.log import Report, select
+from dsom_jax.data import LogOptions, save_ros_map
+from dsom_jax.data.log import Report, majority_beams, select
 from dsom_jax.diagnosis import ego_motion, explain
+from dsom_jax.diagnosis.describe import messages_of
+from dsom_jax.diagnosis.matching import bearings
 from dsom_jax.diagnosis.symptoms import cheap_findings, code_at_the_top, grey_is_free
 from dsom_jax.errors import run_cli
 from dsom_jax.occupancy import from_cells
+from fixtures import strangers
+from fixtures.make_bag import FORMATS, changed_in, without_types, write_bag
 
 LOG = kit.drive()
 
@@ -66,6 +70,50 @@ def test_a_mirrored_scan_without_a_map(call, tmp_path):
     assert "error: scan_mirrored: " in printed
 
 
+def bag(log=LOG):
+    """What a bag of the drive holds."""
+    lidar, entries = log.lidar, []
+    for scan, odometry, stamp in zip(log.ranges, log.odometry, log.stamps, strict=True):
+        entries.append((stamp, "/odom", "odom", tuple(odometry.tolist())))
+        angles = (lidar.angle_min, lidar.angle_increment, 0.0, None, lidar.range_max)
+        entries.append((stamp, "/scan", "laser", (scan, "laser", *angles)))
+    return entries
+
+
+def floor():
+    """A bag's map of the floor."""
+    return [(100.0, "/map", "grid", (100 * kit.cells(), kit.RESOLUTION, -2.0, 1.0))]
+
+
+def test_a_bag_of_humble_and_its_map_in_another_bag(call, tmp_path):
+    """The drive and the map in a bag each, the first without its types."""
+    log = without_types(write_bag(tmp_path, "db3", bag()))
+    plan = write_bag(tmp_path, "bag", floor())
+    found, printed = call(log, "--map", plan)
+    assert found["findings"] == [] and found["log"]["scans_against_map"]["held"] == 1
+    topics = {"/odom (nav_msgs/msg/Odometry)": len(LOG), "/scan (sensor_msgs/msg/LaserScan)": len(LOG)}
+    assert found["log"]["messages"] == topics and found["map"]["cells"] == [95, 150]
+    assert "nothing found that is wrong" in printed
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_messages_of_bags_and_no_grey_in_their_maps(tmp_path, form):
+    path = write_bag(tmp_path, form, [*bag(select(LOG, np.arange(3))), *floor()])
+    assert messages_of(path)["/map (nav_msgs/msg/OccupancyGrid)"] == 1 and grey_is_free(path) == []
+    if form == "db3":
+        assert messages_of(without_types(path)) == messages_of(path)
+
+
+def test_a_map_in_a_bag_that_cannot_be_read_is_one_line(tmp_path, monkeypatch, capsys):
+    write(tmp_path, select(LOG, np.arange(5)))
+    plan = changed_in(write_bag(tmp_path, "db3", floor()), "UPDATE messages SET data = substr(data, 1, 20)")
+    monkeypatch.setattr(sys, "argv", ["inspect", str(tmp_path / "drive.log"), "--map", str(plan)])
+    with pytest.raises(SystemExit) as stop:
+        run_cli(inspect.main)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert stop.value.code == 2 and "topic /map holds no map that can be read (1 unreadable messages on /map" in line
+
+
 @pytest.mark.parametrize("words", [["none.log"], [".", "--map", "none.yaml"], ["drive.log", "--map", "none.yaml"]])
 def test_bad_input_is_one_line(tmp_path, monkeypatch, capsys, words):
     write(tmp_path, select(LOG, np.arange(5)))
@@ -108,6 +156,11 @@ def test_the_robots_own_body():
     (found,) = cheap_findings(replace(LOG, ranges=ranges))
     assert found.code == "self_hits" and "12 of 181 beams (40:51)" in found.says
     assert codes(replace(LOG, ranges=ranges, odometry=LOG.odometry * 0.01)) == []
+    mask, least = (found.fix.split(word)[1].strip(" ,or") for word in ("--laser-mask", "--laser-min-range"))
+    mask = mask.split(",")[0]
+    hidden = LogOptions(laser_mask=tuple(mask.split())).masked(bearings(LOG.lidar))
+    np.testing.assert_array_equal(np.flatnonzero(hidden), np.arange(40, 52))
+    assert float(least) == pytest.approx(0.35)
 
 
 def test_odometry_that_stands_still_for_a_while():
@@ -129,10 +182,21 @@ def test_odometry_that_leaps():
 
 def test_stamps_and_beams_as_the_reader_saw_them():
     report = Report()
-    report.add("scans of 179 beams dropped, the log's lidar has 181", count=7)
+    majority_beams([np.ones(181)] * 9 + [np.ones(179)] * 7, report, LOG.path)
     stamps = LOG.stamps.copy()
     stamps[50] = stamps[49]
     assert codes(replace(LOG, stamps=stamps, report=report)) == ["beams_vary", "odd_stamps"]
+
+
+@pytest.mark.parametrize(("beams", "code"), [((170, 190), ["beams_vary"]), ((60, 61), ["beams_vary"]), (None, [])])
+def test_beams_of_a_bag_that_vary(tmp_path, beams, code):
+    """Every scan of another number of beams, or a third of them of far fewer; all the same get no word."""
+    rng, counts = np.random.default_rng(2), None
+    if beams:
+        counts = np.where(np.arange(strangers.SCANS) % 3 == 0, rng.integers(*beams, strangers.SCANS), 180)
+    entries = [*strangers.lasers(strangers.DRIVE, strangers.LIDAR, beams=counts), *strangers.wheels(strangers.DRIVE)]
+    found = cheap_findings(strangers.load(tmp_path, [*entries, *strangers.MOUNT]))
+    assert [f.code for f in found] == code
 
 
 def test_unknown_space_that_counts_as_free():
