@@ -15,6 +15,7 @@ from dsom_jax import cache, cli, demo, localize
 from dsom_jax.data import RawLog, load_bag
 from dsom_jax.data.bag_writer import odometry_at_rate, write_bag
 from dsom_jax.errors import run_cli
+from dsom_jax.judging.drives import marked
 from dsom_jax.judging.scores import Drive
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.simulate.drive import DriveConfig
@@ -49,10 +50,10 @@ def test_odometry_between_scans_takes_the_short_way():
 
 def test_marks_of_a_kidnapping():
     drive = Drive(tiny_world.drive(10), 100.0 + np.arange(10))
-    assert np.flatnonzero(localize.marked(drive, (104.0,)).episode.kidnapped).tolist() == [4]
+    assert np.flatnonzero(marked(drive, (104.0,)).episode.kidnapped).tolist() == [4]
     # Before the drive, at its start or after it there is nothing to mark.
-    assert not np.asarray(localize.marked(drive, (99.0, 100.0, 200.0)).episode.kidnapped).any()
-    assert localize.marked(drive, ()) is drive
+    assert not np.asarray(marked(drive, (99.0, 100.0, 200.0)).episode.kidnapped).any()
+    assert marked(drive, ()) is drive
 
 
 @pytest.fixture
@@ -63,6 +64,20 @@ def small(monkeypatch):
     make = demo.make
     monkeypatch.setattr(demo, "make", lambda folder, seed: make(folder, seed, demo.BUILDING, config))
     monkeypatch.setattr(demo.webbrowser, "open", lambda address: pytest.fail("opened"))
+
+
+def test_under_json_nothing_else_is_on_stdout(tmp_path, monkeypatch, capsys):
+    """Not even that the page is open, which is told where people look."""
+    scene = demo.Scene(tmp_path / "m.yaml", tmp_path / "log", tmp_path / "truth.tum", (1.0,))
+    monkeypatch.setattr(demo, "make", lambda folder, seed: scene)
+    monkeypatch.setattr(localize, "answer", lambda words, carried: {"carried": carried})
+    opened = []
+    monkeypatch.setattr(demo.webbrowser, "open", lambda address: not opened.append(address))
+    monkeypatch.setattr(sys, "argv", ["demo", "--out", str(tmp_path), "--json"])
+    run_cli(demo.main)
+    printed = capsys.readouterr()
+    assert json.loads(printed.out) == {"carried": [1.0]} and "open in your browser" in printed.err
+    assert opened == [(tmp_path / "report.html").resolve().as_uri()]
 
 
 @pytest.mark.slow

@@ -10,14 +10,15 @@ import numpy as np
 import pytest
 
 import tiny_world
-from dsom_jax import bench, export, localize
+from dsom_jax import bench, export, localize, localize_args
 from dsom_jax.data import load_log, load_map, load_tum, save_tum
 from dsom_jax.data.suite import Suite
 from dsom_jax.episode import Episode
 from dsom_jax.errors import UserError
 from dsom_jax.geometry import relative
 from dsom_jax.judging import foreign
-from dsom_jax.judging.scores import Drive, Outcome
+from dsom_jax.judging.drives import carried_over
+from dsom_jax.judging.scores import Drive, Outcome, answered
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.montecarlo import Result
 
@@ -106,15 +107,15 @@ def test_localize_holds_all_against_both_references(tmp_path):
         sure, localized = np.full((1, UPDATES), 0.01), np.zeros((1, UPDATES), np.int8)
         info = SimpleNamespace(mean=poses, cluster=poses, lost=sure, p_lost=sure, verdict=localized)
         outcomes.append(Outcome(d, Result(info, None, None), 1.0))
-    args = localize.Args(map=tmp_path, log=tmp_path, out=tmp_path)
-    on_plan = localize.carried_over(drives, tmp_path / "plan.tum")
+    args = localize_args.Args(map=tmp_path, log=tmp_path, out=tmp_path)
+    on_plan = carried_over(drives, tmp_path / "plan.tum")
     others = {"amcl": foreign.replies_of(tmp_path / "plan.tum", drives)}
-    found = localize.summary_of(outcomes, tiny_world.grid(), args, on_plan, others)
+    found = localize.summary_of(outcomes, answered(outcomes, args.method), tiny_world.grid(), args, on_plan, others)
     theirs = found["external"]["amcl"]
     assert found["converged"] == found["kidnap"]["converged"] == theirs["on_plan"]["converged"] == 1
     assert found["on_plan"]["converged"] == theirs["converged"] == 0
     assert set(found["on_plan"]) <= set(found) and found["right_room"] == 1
-    assert localize.carried_over(drives, None) is None
+    assert carried_over(drives, None) is None
 
 
 def test_an_exported_suite_is_read_back(tmp_path):

@@ -45,7 +45,7 @@ def outcome(late: tuple[int, int], start: float = 100.0, mean_off: float = 1.0, 
 
 
 def scored(*outcomes, method="adam_robust", seed=0):
-    given = [judging.replies(o.result.info, judging.judged_by(method)) for o in outcomes]
+    given = judging.answered(outcomes, method)
     return judging.scores([o.drive for o in outcomes], given, GRID, seed, rooms_of(GRID))
 
 
@@ -126,14 +126,16 @@ def test_the_seed_is_that_of_the_intervals(monkeypatch):
     assert found["seed"] == found["kidnap"]["seed"] == 7
 
 
-def test_the_estimate_is_the_cluster_of_run_0_and_of_two_segments_the_earlier_counts(tmp_path):
+@pytest.mark.parametrize(("method", "estimate"), [("adam_robust", "cluster"), ("adam", "mean")])
+def test_the_estimate_is_what_run_0_is_judged_by_and_of_two_segments_the_earlier_counts(tmp_path, method, estimate):
     early, later = outcome((0, 8), start=100.0), outcome((8, 0), start=110.0)
-    judging.save_estimate(tmp_path / "e.tum", [early, later])
+    given = judging.answered([early, later], method)
+    judging.save_estimate(tmp_path / "e.tum", [early.drive, later.drive], given)
     saved = load_tum(tmp_path / "e.tum")
     np.testing.assert_allclose(saved.stamps, np.arange(100.0, 134.0))
-    clusters = [np.asarray(o.result.info.cluster)[0] for o in (early, later)]
-    np.testing.assert_allclose(saved.poses[:24], clusters[0], atol=1e-6)
-    np.testing.assert_allclose(saved.poses[24:], clusters[1][14:], atol=1e-6)
+    first, second = (np.asarray(getattr(o.result.info, estimate))[0] for o in (early, later))
+    np.testing.assert_allclose(saved.poses[:24], first, atol=1e-6)
+    np.testing.assert_allclose(saved.poses[24:], second[14:], atol=1e-6)
 
 
 def framed(shift: tuple[float, float, float], off: float, seed: int = 0) -> tuple[Drive, judging.Replies]:

@@ -23,8 +23,8 @@ LAYERS = (
     ("proposals",),
     ("belief",),
     ("filters", "training", "montecarlo", "ambiguity"),
-    ("atomic", "cache", "data", "checkpoint", "run_folder", "trained", "plotting", "report", "judging", "view", "maps",
-     "logs", "diagnosis"),
+    ("atomic", "cache", "data", "checkpoint", "run_folder", "trained", "plotting", "report", "summary_table", "judging",
+     "view", "maps", "logs", "diagnosis"),
     ("live",),
     (
         "__main__",
@@ -34,6 +34,7 @@ LAYERS = (
         "train_filter",
         "bench",
         "localize",
+        "localize_args",
         "inspect",
         "demo",
         "certify",

@@ -14,8 +14,10 @@ import pytest
 from evo.tools import file_interface
 
 import tiny_world
-from dsom_jax import localize
+from dsom_jax import localize, localize_args
+from dsom_jax.diagnosis.findings import Finding
 from dsom_jax.errors import run_cli
+from dsom_jax.summary_table import times
 from tiny_log import START, UPDATES, record
 
 KEYS = {
@@ -81,13 +83,19 @@ def test_with_reference(call, room, tmp_path):
     assert np.median(off) < 0.1 and (off.reshape(2, 20)[:, 5:] < 0.5).all()
 
 
-def check_answers(out):
-    """answers.csv says what estimate.tum says, and how sure run 0 was."""
+def answers_of(out):
+    """Rows of answers.csv, which says what estimate.tum says."""
     with (out / "answers.csv").open() as file:
         rows = list(csv.DictReader(file))
     said = file_interface.read_tum_trajectory_file(out / "estimate.tum")
     for column, expected in zip(("stamp", "x", "y"), (said.timestamps, *said.positions_xyz.T[:2]), strict=True):
         np.testing.assert_allclose([float(row[column]) for row in rows], expected, atol=2e-4)
+    return rows
+
+
+def check_answers(out):
+    """How sure run 0 was."""
+    rows = answers_of(out)
     later = [row for n, row in enumerate(rows) if n % 20 >= 5]
     assert all(row["verdict"] == "localized" and row["hypotheses"] == "1" for row in later)
     assert all(float(row["p_lost"]) < 0.05 for row in later)
@@ -156,9 +164,34 @@ def test_live_gives_the_numbers_of_run_0_and_latencies(call, tmp_path):
     assert 0 < latency["median"] <= latency["p99"] <= latency["max"] <= latency["first"] and "latency median" in printed
 
 
-def test_the_filter_of_the_paper(call):
+def test_the_filter_of_the_paper(call, tmp_path):
     summary, _ = call("--method", "adam", "--t-cut", "0.7")
     assert summary["method"] == "adam" and summary["experiments"] == 8
+    answers_of(tmp_path / "out")
+
+
+def test_one_segment_of_a_short_log_in_json(call, tmp_path, monkeypatch):
+    """The whole of stdout is the JSON; what is odd about the log is in the summary and on the page."""
+    odd = Finding("ranges_scaled", "error", "readings are <too long>", "--range-scale 0.001")
+    monkeypatch.setattr(localize, "cheap_findings", lambda log, grid: [odd])
+    runs, run = [], localize.run
+    monkeypatch.setattr(localize, "run", lambda *args: runs.append(args) or run(*args))
+    summary, printed = call("--json", "--segments", "3", "--steps-per-segment", str(UPDATES), "--runs", "2")
+    assert json.loads(printed) == summary
+    few = f"has only 1 different segments of {UPDATES} updates, not 3"
+    assert any(few in note for note in summary["notes"]) and odd.line() in summary["notes"]
+    html = (tmp_path / "out" / "report.html").read_text()
+    assert few in html and "<b>Note</b>error" not in html
+    assert '<li class="error"><b>Error</b>readings are &lt;too long&gt; <em>--range-scale 0.001</em></li>' in html
+    # It is run once, and how long that takes without compiling is not known.
+    assert len(runs) == 1 and summary["ms_per_update"] is None
+
+
+def test_times_that_were_not_measured_are_not_told():
+    assert times({"ms_per_update": None, "runs": 2}) == []
+    assert times({"ms_per_update": 2.0, "runs": 2, "latency_ms": {"max": 3.0}}) == [
+        "2.0 ms per update of all 2 runs", "latency max 3.0 ms",
+    ]  # fmt: skip
 
 
 def test_floor_plans_get_models_of_their_own(call):
@@ -179,7 +212,7 @@ def test_floor_plans_get_models_of_their_own(call):
     ],
 )
 def test_what_the_summary_says_of_the_filter_is_so(fields, proposal):
-    args = localize.Args(Path("m.yaml"), Path("l.log"), Path("out"), particles=8, **fields)
-    filter = localize.build(args, tiny_world.grid(), tiny_world.LIDAR)
-    assert localize.remembers(args) == filter.drawn == (fields == {})
-    assert localize.drawn_from(args) == proposal and not localize.needs_network(args)
+    args = localize_args.Args(Path("m.yaml"), Path("l.log"), Path("out"), particles=8, **fields)
+    filter = localize_args.build(args, tiny_world.grid(), tiny_world.LIDAR)
+    assert localize_args.remembers(args) == filter.drawn == (fields == {})
+    assert localize_args.drawn_from(args) == proposal and not localize_args.needs_network(args)

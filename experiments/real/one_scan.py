@@ -18,7 +18,7 @@ import tyro
 from run import LOGS, commit
 from run import Args as Series
 
-from dsom_jax import checkpoint, localize, report
+from dsom_jax import checkpoint, localize, localize_args, report
 from dsom_jax.data import RawLog, load_log, load_ros_map
 from dsom_jax.errors import UserError, run_cli
 from dsom_jax.filters.methods import make_proposal
@@ -47,7 +47,7 @@ class Args:
     """Network; default: the one in the repository."""
 
 
-def scans(args: localize.Args, log: RawLog) -> tuple[Array, Array]:
+def scans(args: localize_args.Args, log: RawLog) -> tuple[Array, Array]:
     """Ranges (N, B) and reference poses (N, 3)."""
     drives = localize.cut(log, args)
     ranges, poses = (jnp.concatenate([getattr(d.episode, key) for d in drives])[::EVERY] for key in ("ranges", "poses"))
@@ -67,7 +67,7 @@ def proposals(name: str, grid: OccupancyGrid, log: RawLog, folder: Path) -> Iter
 def judge(name: str, args: Args, folder: Path) -> dict[str, dict[str, float]]:
     """Quality of every proposal on one log, printed as it comes."""
     place, kept = LOGS[name]
-    options = localize.Args(map=args.data / place / "map.yaml", log=args.data / kept / "log.clf.gz", out=args.out)
+    options = localize_args.Args(map=args.data / place / "map.yaml", log=args.data / kept / "log.clf.gz", out=args.out)
     grid, log = load_ros_map(options.map), localize.limited(load_log(options.log), options.laser_max_range)
     ranges, poses = scans(options, log)
     found = {}

@@ -139,7 +139,8 @@ Written by `python experiments/real/run.py`; do not edit. Every segment starts w
 
 def result_rows(result: dict[str, Any]) -> list[tuple[str, ...]]:
     """Rows of one result: the start, the kidnapping if there is one, mapped segments where there are others."""
-    name, method, ms = result["name"], result["method"], f"{result['ms_per_update']:.0f}"
+    name, method, ms = result["name"], result["method"], result["ms_per_update"]
+    ms = "-" if ms is None else f"{ms:.0f}"  # one segment alone is compiled in its own time
     rows = [(name, method, *numbers(result), ms)]
     if "kidnap" in result:
         rows.append((f"{name}, after the kidnapping", method, *numbers(result["kidnap"]), ""))

@@ -11,11 +11,12 @@ import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from dsom_jax import localize, report
+from dsom_jax import localize, localize_args, report
 from dsom_jax.cli import parse
 from dsom_jax.data import load_log, load_map
 from dsom_jax.data.log import limited
 from dsom_jax.errors import run_cli
+from dsom_jax.judging.scores import answered
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
 
@@ -71,13 +72,13 @@ def judged(case: strangers.Case, truth: Path, folder: Path, args: Args) -> dict:
     path = folder / "made" if (folder / "made").is_dir() else case.write(folder)
     grid = load_map(folder.parents[1] / "map" / "made")
     log = load_log(path, case.options, reference=None if case.own_reference else truth)
-    settings = localize.Args(path, path, folder, runs=args.runs, segments=args.segments, particles=args.particles)
+    settings = localize_args.Args(path, path, folder, runs=args.runs, segments=args.segments, particles=args.particles)
     settings = replace(settings, steps_per_segment=args.steps)
     log = limited(log, settings.laser_max_range)
-    outcomes = localize.localize(
-        localize.build(settings, grid, log.lidar), localize.cut(log, settings), args.runs, settings.seed
-    )
-    summary = json.loads(json.dumps(localize.summary_of(outcomes, grid, settings)))
+    filter = localize_args.build(settings, grid, log.lidar)
+    outcomes = localize.localize(filter, localize.cut(log, settings), args.runs, settings.seed)
+    given = answered(outcomes, settings.method)
+    summary = json.loads(json.dumps(localize.summary_of(outcomes, given, grid, settings)))
     return {rate: summary[rate] for rate in (*RATES, "e_pos_m_median")} | {
         "scans": len(log),
         "notes": log.report.lines(),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 import webbrowser
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dsom_jax import localize, report
+from dsom_jax import localize, localize_args, report
 from dsom_jax.cli import parse, stage
 from dsom_jax.data import RawLog, save_ros_map, save_tum, se2
 from dsom_jax.data.bag_writer import write_bag
@@ -20,6 +21,7 @@ from dsom_jax.errors import UserError, run_cli
 from dsom_jax.lidar import LidarConfig, LidarNoise
 from dsom_jax.simulate.drive import DriveConfig, make_synthetic
 from dsom_jax.simulate.worlds import WorldConfig, make_world
+from dsom_jax.summary_table import print_summary
 
 START = 1_700_000_000.0
 """Stamp of the first scan: a clock as robots have it."""
@@ -63,17 +65,17 @@ def main() -> None:
     folder = report.output_folder(args.out)
     with stage("making a building and a drive"):
         scene = make(folder, args.seed)
-    words = localize.Args(scene.map, scene.log, folder, reference=scene.reference, runs=args.runs, segments=1,
-                          steps_per_segment=0, laser_max_range=LIDAR.range_max, seed=args.seed,
-                          json=args.json)  # fmt: skip
-    localize.check(words)
+    words = localize_args.Args(scene.map, scene.log, folder, reference=scene.reference, runs=args.runs, segments=1,
+                               steps_per_segment=0, laser_max_range=LIDAR.range_max, seed=args.seed,
+                               json=args.json)  # fmt: skip
+    localize_args.check(words)
     summary = localize.answer(words, scene.carried)
     if args.json:
         print(json.dumps(report.plain(summary), indent=2))
     else:
-        localize.print_summary(summary, folder)
+        print_summary(summary, folder)
     if args.open and webbrowser.open((folder / "report.html").resolve().as_uri()):
-        print("the page is open in your browser")
+        print("the page is open in your browser", file=sys.stderr if args.json else sys.stdout)
 
 
 def make(folder: Path, seed: int, building: WorldConfig = BUILDING, drive: DriveConfig = DRIVE) -> Scene:

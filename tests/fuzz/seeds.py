@@ -14,7 +14,7 @@ import ezdxf
 import numpy as np
 from PIL import Image
 
-from dsom_jax import bench, evaluate, localize, train, train_filter
+from dsom_jax import bench, evaluate, localize_args, train, train_filter
 from dsom_jax.cli import parse
 from dsom_jax.data import load_log, load_map, load_tum
 from dsom_jax.data.documents import read_json, read_yaml
@@ -154,8 +154,8 @@ def make(folder: Path) -> None:
 def reads_words(folder: Path) -> None:
     """The words of a command line, for each command that knows them, as far as they can be judged without files."""
     words = (folder / "words").read_text(errors="surrogateescape").split()
-    args = parse(localize.Args, "python -m dsom_jax.localize", words)
-    localize.check(args)
+    args = parse(localize_args.Args, "python -m dsom_jax.localize", words)
+    localize_args.check(args)
 
 
 def other_words(folder: Path) -> None:

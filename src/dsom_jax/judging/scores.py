@@ -29,7 +29,7 @@ class Drive(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """Result of one drive and the seconds that it took; those of the first of several include the compilation."""
+    """Result of one drive and the seconds that it took, NaN where they would include a compilation."""
 
     drive: Drive
     result: Result
@@ -57,6 +57,11 @@ def replies(info: Any, estimate: str) -> Replies:
     if hasattr(info, "verdict"):
         return Replies(poses, p_lost, np.asarray(info.verdict) == Verdict.LOCALIZED)
     return Replies(poses) if np.isnan(p_lost).all() else Replies(poses, p_lost, p_lost < CERTAIN)
+
+
+def answered(outcomes: Sequence[Outcome], method: str) -> list[Replies]:
+    """Those of a filter over all drives, by the estimate that ``method`` is judged by."""
+    return [replies(outcome.result.info, judged_by(method)) for outcome in outcomes]
 
 
 def verdicts(infos: Sequence[Any]) -> dict[str, Any]:
@@ -168,9 +173,7 @@ def _sure(drives: Sequence[Drive], given: Sequence[Replies]) -> tuple[np.ndarray
     return np.concatenate([p[0] for p in pairs]), np.concatenate([p[1] for p in pairs])
 
 
-def save_estimate(path: Path, outcomes: list[Outcome]) -> None:
-    """Heaviest cluster of run 0 at every update, in log time; of overlapping segments the earlier one counts."""
-    stamps = np.concatenate([o.drive.stamps for o in outcomes])
-    poses = np.concatenate([np.asarray(o.result.info.cluster)[0] for o in outcomes])
-    stamps, first = np.unique(stamps, return_index=True)
-    save_tum(path, stamps, poses[first])
+def save_estimate(path: Path, drives: Sequence[Drive], given: Sequence[Replies]) -> None:
+    """What run 0 answered at every update, in log time; of overlapping segments the earlier one counts."""
+    stamps, first = np.unique(np.concatenate([drive.stamps for drive in drives]), return_index=True)
+    save_tum(path, stamps, np.concatenate([said.poses[0] for said in given])[first])

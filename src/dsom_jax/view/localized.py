@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from dsom_jax.diagnosis import findings as diagnosed
 from dsom_jax.judging.scores import Outcome, judged_by
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.occupancy import OccupancyGrid
@@ -34,18 +35,25 @@ def write_view(
     grid: OccupancyGrid,
     lidar: LidarConfig,
     summary: dict[str, Any],
+    findings: Sequence[diagnosed.Finding],
     notes: Sequence[str],
     settings: Any,
 ) -> None:
     """``answers.csv``, ``trajectory.png`` and ``report.html``; ``settings`` are the arguments of the command line.
 
-    The outcomes keep the states of all updates (``montecarlo.run(..., keep=range(T))``).
+    The page names the ``findings`` by their severity, then the ``notes``. The outcomes keep the states of all updates
+    (``montecarlo.run(..., keep=range(T))``).
     """
     said = [told(outcome, settings.method) for outcome in outcomes]
-    story = tell(outcomes, said, grid, lidar, summary, notes, settings)
+    story = tell(outcomes, said, grid, lidar, summary, remarks(findings, notes), settings)
     write_answers(folder / "answers.csv", said)
     save_figure(trajectory_figure(story.plan, story.drives[0]), folder / "trajectory.png")
     write_page(folder / "report.html", story)
+
+
+def remarks(findings: Sequence[diagnosed.Finding], notes: Sequence[str]) -> tuple[Finding, ...]:
+    """What the page has to say of map and log."""
+    return (*(Finding(f.says, f.severity, f.fix) for f in findings), *(Finding(note) for note in notes))
 
 
 def told(outcome: Outcome, method: str) -> Answers:
@@ -60,7 +68,7 @@ def tell(
     grid: OccupancyGrid,
     lidar: LidarConfig,
     summary: dict[str, Any],
-    notes: Sequence[str],
+    findings: tuple[Finding, ...],
     settings: Any,
 ) -> Story:
     """The story of all drives."""
@@ -77,7 +85,7 @@ def tell(
         summary,
         JUDGED if judged else UNJUDGED,
         (_segments(summary),) if judged else (),
-        tuple(Finding(note) for note in notes),
+        findings,
         dataclasses.asdict(settings),
         caption=f"Run 1 of {summary['runs']} of each segment.",
     )
