@@ -13,7 +13,6 @@ import random
 import signal
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 
@@ -30,212 +29,23 @@ os.environ |= {
     "RMW_IMPLEMENTATION": "rmw_fastrtps_cpp",
 }
 
-import rclpy
-from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped, TransformStamped
-from lifecycle_msgs.srv import ChangeState, GetState
-from nav_msgs.msg import OccupancyGrid
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from lifecycle_msgs.srv import GetState
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
-from sensor_msgs.msg import LaserScan
 from std_srvs.srv import Empty
-from tf2_msgs.msg import TFMessage
 
-import tiny_world
 from dsom_jax.data import se2
-from dsom_jax.filters.settings import REAL
-from dsom_jax.lidar import LidarConfig
-from dsom_jax.raycast import RaycastConfig, make_tables
 from dsom_jax.ros2 import messages
 from dsom_jax.ros2.node import optional
+from fixtures.ros2_player import FRAMES, Player, wait_for
 from test_ros2_parameters import NAV2
 
-LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-MOUNT = (0.1, 0.05, 2.0)
-LIDAR = LidarConfig(beams=720, angle_increment=2 * math.pi / 720, range_max=5.0, mount=MOUNT, upside_down=True)
-"""Head down, turned and beside the axis: all of it has to come from tf."""
-RADIUS, STEPS = 0.6, 240
-PLACES = ((2.92, 2.87), (4.3, 1.5))
-"""Middles of two circles, in the frame of the tiny room."""
-FRAMES = {"odom_frame_id": "robot/odom", "base_frame_id": "robot/base_footprint"}
 PARAMETERS = NAV2 | FRAMES | {
     "use_sim_time": False, "min_particles": 200, "update_min_d": 0.1, "update_min_a": 0.1, "random_seed": 4,
     "transform_tolerance": 0.5, "cloud_rate": 5.0,
 }  # fmt: skip
 TOLERANCE = PARAMETERS["transform_tolerance"]
-
-
-def circle(place: tuple[float, float]) -> np.ndarray:
-    """(STEPS, 3) poses in the map frame, once round."""
-    phase = 2 * np.pi * np.arange(STEPS) / STEPS
-    x, y = place[0] + RADIUS * np.cos(phase), place[1] + RADIUS * np.sin(phase)
-    local = np.stack([x, y, se2.wrap(phase + np.pi / 2)], -1)
-    return np.asarray(tiny_world.grid().from_grid(local), np.float64)
-
-
-class Player:
-    """A robot that drives in a circle, and what it hears from the node."""
-
-    def __init__(self) -> None:
-        rclpy.init()
-        self.node = rclpy.create_node("player")
-        grid = tiny_world.grid()
-        # The walls of maps made from scans do not begin at the near edge of their cells.
-        tables = make_tables(grid, RaycastConfig("exact", surface=REAL.robust_raycast.surface), LIDAR.range_max)
-        self.paths = [circle(place) for place in PLACES]
-        self.scans = [np.asarray(tiny_world.cast(tables, path, LIDAR)) for path in self.paths]
-        self.lock, self.truth, self.sent = threading.Lock(), {}, {}
-        self.place, self.step, self.speed, self.rate = 0, 0, 1, 20.0
-        self.odometry = np.array([-3.0, 8.0, 1.0])
-        self.poses: list = []
-        self.transforms: list = []
-        self.clouds: list = []
-        self.places: list = []
-        self.told: list = []
-        self._publishers(grid)
-        self._subscriptions()
-        self.executor = SingleThreadedExecutor()
-        self.executor.add_node(self.node)
-        self.running = True
-        self.threads = [threading.Thread(target=self.executor.spin, daemon=True),
-                        threading.Thread(target=self.play, daemon=True)]  # fmt: skip
-        for thread in self.threads:
-            thread.start()
-
-    def _publishers(self, grid) -> None:
-        node = self.node
-        self.scan_out = node.create_publisher(LaserScan, "scan", qos_profile_sensor_data)
-        self.tf_out = node.create_publisher(TFMessage, "/tf", 100)
-        self.initial = node.create_publisher(PoseWithCovarianceStamped, "initialpose", 10)
-        self.static_out = node.create_publisher(TFMessage, "/tf_static", LATCHED)
-        x, y, yaw = MOUNT
-        mount = TransformStamped(child_frame_id="robot/laser")
-        mount.header.frame_id = FRAMES["base_frame_id"]
-        mount.transform.translation.x, mount.transform.translation.y = x, y
-        # Half a turn about x, then the yaw: the quaternion of both.
-        mount.transform.rotation.x, mount.transform.rotation.y = math.cos(yaw / 2), math.sin(yaw / 2)
-        mount.transform.rotation.w = 0.0
-        self.static_out.publish(TFMessage(transforms=[mount]))
-        self.map_out = node.create_publisher(OccupancyGrid, "map", LATCHED)
-        message = OccupancyGrid()
-        message.header.frame_id = "map"
-        message.info.height, message.info.width = grid.shape
-        message.info.resolution = grid.resolution
-        messages.set_pose(message.info.origin, np.asarray(grid.origin))
-        message.data = np.where(np.asarray(grid.occupied), 100, 0).astype(np.int8).reshape(-1).tolist()
-        self.map_out.publish(message)
-
-    def _subscriptions(self) -> None:
-        node = self.node
-
-        def hear(kind, topic, qos, where):
-            node.create_subscription(kind, topic, lambda m: where.append((time.time(), m)), qos)
-
-        hear(PoseWithCovarianceStamped, "amcl_pose", LATCHED, self.poses)
-        hear(TFMessage, "/tf", 100, self.transforms)
-        hear(optional("nav2_msgs/msg", "ParticleCloud") or PoseArray, "particle_cloud", qos_profile_sensor_data,
-             self.clouds)  # fmt: skip
-        hear(PoseArray, "hypotheses", LATCHED, self.places)
-        diagnostics = optional("diagnostic_msgs/msg", "DiagnosticArray")
-        if diagnostics:
-            hear(diagnostics, "/diagnostics", 10, self.told)
-
-    def play(self) -> None:
-        """Scans and odometry at ``rate``, stamped as they are sent."""
-        due = time.time()
-        while self.running:
-            before = self.paths[self.place][self.step]
-            self.step = (self.step + self.speed) % STEPS
-            pose = self.paths[self.place][self.step]
-            self.odometry = se2.compose(self.odometry, se2.relative(before, pose))
-            self.send(time.time(), pose, self.scans[self.place][self.step])
-            due = max(due + 1 / self.rate, time.time() - 0.1)
-            time.sleep(max(due - time.time(), 0.0))
-
-    def send(self, at: float, pose: np.ndarray, ranges: np.ndarray) -> None:
-        transform = TransformStamped()
-        messages.set_transform(transform, FRAMES["odom_frame_id"], FRAMES["base_frame_id"], self.odometry, at)
-        self.tf_out.publish(TFMessage(transforms=[transform]))
-        scan = LaserScan(angle_min=LIDAR.angle_min, angle_increment=LIDAR.angle_increment, range_max=LIDAR.range_max)
-        messages.set_stamp(scan.header.stamp, at)
-        scan.header.frame_id, scan.ranges = "robot/laser", ranges
-        with self.lock:
-            self.truth[round(at, 6)] = pose, self.odometry
-            self.sent[round(at, 6)] = at
-        self.scan_out.publish(scan)
-
-    def true_at(self, stamp: float) -> tuple[np.ndarray, np.ndarray]:
-        """Pose in the map and of the odometry when the scan of ``stamp`` was sent."""
-        with self.lock:
-            return self.truth[round(stamp, 6)]
-
-    def carry_off(self) -> None:
-        """To the other circle, unnoticed by the odometry."""
-        self.place, self.step = 1 - self.place, (self.step + STEPS // 3) % STEPS
-
-    def errors(self, since: float = 0.0) -> list[tuple[float, float]]:
-        """Metres and radians that the poses heard since then are off."""
-        found = []
-        for heard, message in list(self.poses):
-            if heard >= since:
-                pose, _ = messages.pose_of(message.pose)
-                truth, _ = self.true_at(messages.stamp_of(message))
-                x, y, turn = se2.relative(truth, pose)
-                found.append((math.hypot(x, y), abs(turn)))
-        return found
-
-    def map_to_odom(self, since: float = 0.0) -> list[tuple[float, float, np.ndarray]]:
-        """(heard, stamp, pose) of the transforms that the node sent."""
-        return [
-            (heard, messages.stamp_of(t), np.array([
-                t.transform.translation.x, t.transform.translation.y,
-                2 * math.atan2(t.transform.rotation.z, t.transform.rotation.w)]))
-            for heard, message in list(self.transforms)
-            for t in message.transforms
-            if t.child_frame_id == FRAMES["odom_frame_id"] and heard >= since
-        ]  # fmt: skip
-
-    def ask(self, kind, name: str, request, within: float = 90.0):
-        """The answer of a service."""
-        client = self.node.create_client(kind, name)
-        try:
-            assert client.wait_for_service(within), f"no service {name}"
-            future = client.call_async(request)
-            wait_for(future.done, within, f"an answer of {name}")
-            return future.result()
-        finally:
-            self.node.destroy_client(client)
-
-    def transition(self, number: int) -> None:
-        request = ChangeState.Request()
-        request.transition.id = number
-        assert self.ask(ChangeState, "amcl/change_state", request).success
-
-    def found(self, within: float = 120.0) -> float:
-        """Wait for three good poses in a row from now on; seconds that it took."""
-        start = time.time()
-
-        def good() -> bool:
-            errors = self.errors(start)
-            return len(errors) >= 3 and all(metres < 0.3 and turn < 0.2 for metres, turn in errors[-3:])
-
-        wait_for(good, within, "three good poses")
-        return time.time() - start
-
-    def close(self) -> None:
-        self.running = False
-        self.threads[1].join(2)
-        self.executor.shutdown()
-        rclpy.shutdown()
-
-
-def wait_for(true, within: float, what: str) -> None:
-    """Wait until ``true()``."""
-    end = time.time() + within
-    while not true():
-        assert time.time() < end, f"no {what} within {within} s"
-        time.sleep(0.05)
 
 
 @pytest.fixture(scope="module")
