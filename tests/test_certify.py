@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import sys
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ import pytest
 from dsom_jax import certify
 from dsom_jax.ambiguity import AmbiguityConfig, Tried, log_odds, look_alikes, try_out
 from dsom_jax.data.ros_map import save_ros_map
-from dsom_jax.errors import UserError, run_cli
+from dsom_jax.errors import run_cli
 from dsom_jax.lidar import LidarConfig, LidarNoise
 from dsom_jax.occupancy import from_cells
 
@@ -142,8 +141,11 @@ def test_lidar_of_three_numbers():
     assert turn.angle_increment == pytest.approx(math.radians(1))
 
 
-def test_a_map_without_room():
+def test_a_map_without_room(tmp_path, monkeypatch, capsys):
     cells = np.ones((8, 8), bool)
     cells[4, 4] = False
-    with pytest.raises(UserError, match=r"m\.yaml: the map has no free cell"):
-        certify.check_fits(replace(certify.Args(None, None), map="m.yaml"), from_cells(cells, resolution=0.25))
+    save_ros_map(from_cells(cells, resolution=0.25), tmp_path / "m.yaml")
+    monkeypatch.setattr(sys, "argv", ["certify", "--map", str(tmp_path / "m.yaml"), "--out", str(tmp_path / "out")])
+    with pytest.raises(SystemExit) as stop:
+        run_cli(certify.main)
+    assert stop.value.code == 2 and "m.yaml: the map has no free cell" in capsys.readouterr().err

@@ -90,7 +90,8 @@ def try_out(
     batches: Callable[[Sequence[int]], Iterable[int]] = iter,
 ) -> Tried:
     """Drive about and see what the belief makes of it; ``batches`` may show how far it has come."""
-    belief, poses = build(grid, lidar, config), plan(grid, config, seed)
+    poses = plan(grid, config, seed)
+    belief = build(grid, lidar, config)
     tables = make_tables(grid, RaycastConfig("exact"), lidar.range_max)
     parts = []
     for start in batches(range(0, config.drives, config.batch)):

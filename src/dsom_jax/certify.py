@@ -57,9 +57,10 @@ def main() -> None:
     grid = load_map(args.map)
     folder = report.output_folder(args.out)
     config = AmbiguityConfig(drives=args.drives)
-    with stage("planning drives"):
-        check_fits(args, grid)
-    tried = try_out(grid, lidar, config, args.seed, lambda batches: each(batches, "drives"))
+    try:
+        tried = try_out(grid, lidar, config, args.seed, lambda batches: each(batches, "drives"))
+    except UserError as error:
+        raise UserError(f"{args.map}: {error}") from None
     result, pairs = certify(tried, grid)
     with stage("writing the page"):
         report.write_json(folder / "certify.json", result)
@@ -83,16 +84,6 @@ def lidar_of(args: Args) -> LidarConfig:
     fov = math.radians(args.fov)
     step = fov / (args.beams if args.fov == 360 else max(args.beams - 1, 1))
     return LidarConfig(args.beams, -fov / 2, step, range_max=args.range)
-
-
-def check_fits(args: Args, grid: OccupancyGrid) -> None:
-    """UserError for a map in which nobody can drive."""
-    from dsom_jax.simulate.paths import roads
-
-    try:
-        roads(grid)
-    except UserError as error:
-        raise UserError(f"{args.map}: {error}") from None
 
 
 def certify(tried: Tried, grid: OccupancyGrid) -> tuple[dict[str, Any], list[Lookalike]]:

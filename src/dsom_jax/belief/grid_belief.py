@@ -6,8 +6,9 @@ odometry and multiplies it by what the scan says. While nearly all of it lies in
 they can reach are moved and judged; as soon as the scan speaks against all of them, the whole grid is judged again.
 
 What is exact and what is not: moving and judging are Bayes' rule on the cells, for the beam model to a power (the
-temper), as neighbouring beams and scans taken one after another err alike. What a focus leaves out is at most
-``_SPILT`` of the mass at each update. A scan counts as much as it is new (:func:`novelty`).
+temper), as neighbouring beams and scans taken one after another err alike. A focus begins where it leaves out at most
+``_SPILT`` of the mass; what it cannot reach later is left out until it ends. A scan counts as much as it is new
+(:func:`novelty`).
 """
 
 from __future__ import annotations
