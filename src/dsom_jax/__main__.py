@@ -9,15 +9,20 @@ from importlib.util import find_spec
 
 from dsom_jax.errors import UserError, run_cli
 
-COMMANDS = ("demo", "bench", "localize", "certify", "export", "evaluate", "train", "train_filter")
+COMMANDS = ("demo", "inspect", "localize", "ros2", "certify", "bench", "export", "evaluate", "train", "train_filter")
+_PACKAGES = ("ros2",)
+"""Commands that are folders."""
 
 
 def start(name: str) -> None:
     """Run the command ``name`` with the words of the command line; what it needs is imported here."""
-    run_cli(lambda: import_module(f"dsom_jax.{name}").main())
+    module = f"dsom_jax.{name}.__main__" if name in _PACKAGES else f"dsom_jax.{name}"
+    run_cli(lambda: import_module(module).main())
 
 
-demo, bench, localize, certify, export, evaluate, train, train_filter = (partial(start, name) for name in COMMANDS)
+demo, inspect, localize, ros2, certify, bench, export, evaluate, train, train_filter = (
+    partial(start, name) for name in COMMANDS
+)
 
 
 def main() -> None:
