@@ -23,8 +23,9 @@ LIDARS = (
     LidarConfig(beams=360, angle_min=-np.pi, angle_increment=np.pi / 180, range_max=12.0),
 )
 FAULTS = (
-    *["clean"] * 5, *["half"] * 4, "changed", *["symmetric"] * 3, *["wrong map"] * 3, *["yaw"] * 4, *["mirrored"] * 2,
-    *["scaled"] * 2, *["increment"] * 2, *["odometry sign"] * 2, *["crowd"] * 4, *["glass"] * 2, "reset", "slip",
+    *["clean"] * 5, *["half"] * 4, *["changed"] * 3, *["symmetric"] * 3, *["wrong map"] * 3, *["yaw"] * 4,
+    *["mirrored"] * 2, *["scaled"] * 2, *["increment"] * 2, *["odometry sign"] * 2, *["crowd"] * 4, *["glass"] * 2,
+    "reset", "slip",
 )  # fmt: skip
 _YAWS = (10, 12, 15, 20, 45, 90, 135, 180)
 
