@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from functools import partial
 from importlib import import_module
-from importlib.util import find_spec
 
 from dsom_jax.errors import UserError, run_cli
 
@@ -27,7 +26,7 @@ demo, inspect, localize, ros2, certify, bench, export, evaluate, train, train_fi
 
 def main() -> None:
     """The first word of the command line is a command."""
-    names = ", ".join(name for name in COMMANDS if find_spec(f"dsom_jax.{name}"))
+    names = ", ".join(COMMANDS)
     if len(sys.argv) < 2 or sys.argv[1] in ("-h", "--help"):
         print(f"usage: python -m dsom_jax COMMAND ...; commands: {names}")
         return
