@@ -45,8 +45,7 @@ def fit(ranges: Array, expected: Array, seen: Array, range_max: float) -> Fit:
     Neighbouring beams lend their expected ranges: at an edge either wall will do; the first and the last beam have one
     neighbour each. A beam without return where no wall is expected says nothing.
     """
-    cut = lambda r: jnp.minimum(r, range_max)  # noqa: E731
-    z, wall, edge = cut(ranges), cut(expected), cut(seen)
+    z, wall, edge = (jnp.minimum(r, range_max) for r in (ranges, expected, seen))
     before = jnp.concatenate([wall[..., :1], wall[..., :-1]], -1)
     after = jnp.concatenate([wall[..., 1:], wall[..., -1:]], -1)
     around = jnp.stack([before, wall, after])
@@ -57,10 +56,10 @@ def fit(ranges: Array, expected: Array, seen: Array, range_max: float) -> Fit:
     judged = valid & ~unknown & ~empty
     short, long = judged & (z < nearest - _TOLERANCE), judged & (z > farthest + _TOLERANCE)
     count = judged.sum(-1)
-    share = lambda what, whole: what.sum(-1) / jnp.maximum(whole, 1)  # noqa: E731
     hit = judged & ~short & ~long
-    return Fit(share(hit, count), share(short, count), share(long, count),
-               share(unknown, valid.sum(-1)), count / ranges.shape[-1])  # fmt: skip
+    hits, shorts, longs = (what.sum(-1) / jnp.maximum(count, 1) for what in (hit, short, long))
+    unseen = unknown.sum(-1) / jnp.maximum(valid.sum(-1), 1)
+    return Fit(hits, shorts, longs, unseen, count / ranges.shape[-1])
 
 
 class Track(NamedTuple):

@@ -78,7 +78,7 @@ class Learned:
         return _one_run(self, key, state, inputs, prepared)
 
 
-@sequential_vmap
+@sequential_vmap  # type: ignore[untyped-decorator]  # as JAX has it
 def _one_run(filter: Any, key: Key, state: Any, inputs: Inputs, prepared: ScanCode) -> tuple[Any, Info]:
     key, state, inputs, prepared = jax.lax.optimization_barrier((key, state, inputs, prepared))
     state = jax.lax.optimization_barrier(filter.advance(key, state, inputs, prepared))

@@ -9,6 +9,7 @@ of the map; there :func:`own_gradients` says no, and what is differentiated is w
 from __future__ import annotations
 
 from itertools import pairwise
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -132,12 +133,12 @@ def _batch_norm_elu(x: Array, scale: Array, bias: Array) -> tuple[Array, Array, 
     return elu((x - mean) * (scale * jax.lax.rsqrt(variance + EPSILON)) + bias), mean, variance
 
 
-def _batch_norm_elu_fwd(x: Array, scale: Array, bias: Array):
+def _batch_norm_elu_fwd(x: Array, scale: Array, bias: Array) -> tuple[tuple[Array, Array, Array], Any]:
     out, mean, variance = _batch_norm_elu(x, scale, bias)
     return (out, mean, variance), (x, out, scale, mean, variance)
 
 
-def _batch_norm_elu_bwd(saved, gradients):
+def _batch_norm_elu_bwd(saved: Any, gradients: tuple[Array, ...]) -> tuple[Array, Array, Array]:
     x, out, scale, mean, variance = saved
     inverse = jax.lax.rsqrt(variance + EPSILON)
     # The slope of ELU follows from its value: 1 above zero, exp(x) = value + 1 below.

@@ -24,6 +24,7 @@ from sensor_msgs.msg import LaserScan
 from std_srvs.srv import Empty
 from tf2_msgs.msg import TFMessage
 
+from dsom_jax.data.tf_tree import stamp_of
 from dsom_jax.errors import UserError
 from dsom_jax.live import Answer
 from dsom_jax.occupancy import OccupancyGrid
@@ -189,7 +190,7 @@ class Amcl(LifecycleNode):
         except UserError as error:
             self._say("warn", str(error))
             return
-        self.engine.hear_pose(pose, covariance, messages.stamp_of(message))
+        self.engine.hear_pose(pose, covariance, stamp_of(message))
 
     def _set_initial_pose(self, request: Any, response: Any) -> Any:
         self._initial_pose(request.pose)

@@ -50,7 +50,9 @@ def _near_third(labels: Array, low: Array, high: Array) -> Array:
     return third
 
 
-def build_walls(key: Key, style: Style, labels: Array, is_corridor: Array, door_cells: tuple[int, int]) -> tuple:
+def build_walls(
+    key: Key, style: Style, labels: Array, is_corridor: Array, door_cells: tuple[int, int]
+) -> tuple[Array, Array]:
     """Walls (H, W) with doors and openings cut out, and the cells (H, W) that must stay clear before the doors.
 
     ``door_cells``: half widths of narrow and wide doors, cells.
