@@ -162,7 +162,7 @@ def test_command_line(suite, monkeypatch, tmp_path, capsys):
     assert list(data["methods"]) == ["mcl", "robust_likelihood_grid"] and data["seed"] == 2
     assert data["methods"]["mcl"]["global"]["e_pos_m"] is None
     assert {p.name for p in (tmp_path / "out").iterdir()} == {
-        "bench.json", "bench.md", "position_error.png", "converging_steps.png", "error_evolution.png",
+        "bench.json", "bench.md", "report.html", "position_error.png", "converging_steps.png", "error_evolution.png",
         "map_mcl.png", "map_robust_likelihood_grid.png",
     }  # fmt: skip
 

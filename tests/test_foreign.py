@@ -17,6 +17,7 @@ from dsom_jax.episode import Episode
 from dsom_jax.errors import UserError
 from dsom_jax.geometry import relative
 from dsom_jax.judging import foreign
+from dsom_jax.judging.by_drive import judge_drives
 from dsom_jax.judging.drives import carried_over
 from dsom_jax.judging.scores import Drive, Outcome, answered
 from dsom_jax.lidar import LidarConfig
@@ -53,7 +54,9 @@ def tum_of(folder, suite, off=(0.0, 0.0), late: float = 0.0) -> None:
 def test_bench_judges_a_trajectory_as_a_method(tmp_path):
     suite = made_suite()
     tum_of(tmp_path, suite, (0.3, 5.0), late=0.04)
-    entry = bench.foreign(suite, foreign.replies_of_suite(tmp_path, foreign.drives_of(suite)), 0)
+    drives = foreign.drives_of(suite)
+    judged = judge_drives([drive.episode for drive in drives], foreign.replies_of_suite(tmp_path, drives))
+    entry = bench.foreign(judged, 0)
     first, second = entry["global"], entry["kidnap"]
     assert (first["experiments"], first["converged"], first["steps_median"]) == (2, 1.0, 0)
     assert first["e_pos_m"] == pytest.approx(0.3, abs=1e-5) and second["converged"] == 0

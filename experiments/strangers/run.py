@@ -1,7 +1,7 @@
 """Bags as strangers bring them, each beside its clean twin, in a made building.
 
-python experiments/strangers/run.py --out DIR writes REPORT.md and results.json.
-Rates are to be within 2 points of the twins'.
+python experiments/strangers/run.py --out DIR writes REPORT.md and results.json; rows that exist are retained, so an
+interrupted series goes on. Rates are to be within 2 points of the twins'.
 """
 
 from __future__ import annotations
@@ -53,9 +53,10 @@ def main() -> None:
     (folder / "map").mkdir(exist_ok=True)
     if not (folder / "map" / "made").is_dir():
         write_bag(folder / "map", "db3", cells)
-    results, twins = {}, {}
+    rows = folder / "results.json"
+    results, twins = json.loads(rows.read_text()) if rows.exists() else {}, {}
     for name, (case, twin) in strangers.cases(drive, spinning).items():
-        if args.only not in name:
+        if args.only not in name or name in results:
             continue
         truth = strangers.truth(spinning if "turning" in name else drive, folder / name)
         if id(twin) not in twins:
@@ -63,7 +64,7 @@ def main() -> None:
         found = judged(case, truth, folder / name / "bag", args)
         results[name] = {"bag": found, "twin": twins[id(twin)]}
         print(name, *(f"{r} {found[r]:.3f} / {twins[id(twin)][r]:.3f}" for r in RATES), found["notes"], flush=True)
-        report.write_json(folder / "results.json", results)
+        report.write_json(rows, results)
         (folder / "REPORT.md").write_text(table(results, args))
 
 

@@ -19,13 +19,16 @@ from dsom_jax.errors import UserError, run_cli
 from dsom_jax.filters.methods import METHODS, STANDARD, build_filter, network_of
 from dsom_jax.filters.settings import WEIGHT_POWER
 from dsom_jax.judging import metrics
+from dsom_jax.judging.by_drive import Judged, Worst, by_drive, judge_drives, worst_run
 from dsom_jax.judging.foreign import drives_of, named, replies_of_suite
 from dsom_jax.judging.run_table import RunTable, join, run_rows, write_runs
-from dsom_jax.judging.scores import Replies, judge, judged_by, replies
+from dsom_jax.judging.scores import judge, judged_by, replies
 from dsom_jax.montecarlo import Result, run, run_keys, signature
 from dsom_jax.occupancy import OccupancyGrid
+from dsom_jax.protocol.digests import digests
 from dsom_jax.trained import by_kind, check_networks, check_used, find_networks, load_networks
 from dsom_jax.types import Filter, Key, Proposal
+from dsom_jax.view.benched import write_view
 
 ESTIMATES = ("mean", "cluster")
 """The weighted mean of the paper, and the mean of the heaviest cluster."""
@@ -53,7 +56,7 @@ class Args:
     weight_power: float = WEIGHT_POWER
     """Power of Eq 15 in the `_sharp` methods; the others weigh as the paper prints, by Eq 15 itself."""
     out: Path | None = None
-    """Folder for bench.json, bench.md and figures."""
+    """Folder for bench.json, bench.md, report.html and figures."""
     checkpoint: Path | None = None
     """Folder of a trained DSOM; default: the one in the repository."""
     per_run: bool = False
@@ -94,6 +97,7 @@ class Record(NamedTuple):
     Attributes:
         runs: by estimate (``mean``, ``cluster``) and phase.
         traces: E_pos (R, T) of each sequence, metres, by the estimate that the method is judged by.
+        worst: run of each sequence, likewise; the poses of the others are not kept.
         ms_per_step: milliseconds of one update of all runs.
         compilations: how many shapes of map and episode had to be compiled.
         table: every single run, by the estimate that the method is judged by.
@@ -102,6 +106,7 @@ class Record(NamedTuple):
 
     runs: dict[str, dict[str, metrics.Runs]]
     traces: list[np.ndarray]
+    worst: list[Worst]
     ms_per_step: float
     compilations: int
     table: RunTable
@@ -161,7 +166,7 @@ def left_out(methods: Sequence[str]) -> str:
 def run_method(name: str, suite: Suite, keys: Sequence[Key], build: Build, progress: Advance | None = None) -> Record:
     """One method on all sequences."""
     parts: dict[str, dict[str, list[metrics.Runs]]] = {e: {"global": [], "kidnap": []} for e in ESTIMATES}
-    traces, rows, clock = [], [], Clock()
+    traces, worst, rows, clock = [], [], [], Clock()
     first: tuple[Any, ...] = ()
     filters: dict[Any, Filter] = {}
     for number, (where, grid, episode) in enumerate(suite.episodes):
@@ -175,11 +180,13 @@ def run_method(name: str, suite: Suite, keys: Sequence[Key], build: Build, progr
                 by_phase[phase] += runs
                 if estimate == judged_by(name):
                     rows += [run_rows(name, phase, number, part, some) for part, some in enumerate(runs)]
-        e_pos, _ = metrics.pose_error(getattr(result.info, judged_by(name)), episode.poses)
-        traces.append(np.asarray(e_pos))
+        said = getattr(result.info, judged_by(name))
+        errors = metrics.pose_error(said, episode.poses)
+        traces.append(np.asarray(errors[0]))
+        worst.append(worst_run(said, *errors))
         first = first or (filter, result)
     pooled = {e: {phase: metrics.pool(runs) for phase, runs in by.items()} for e, by in parts.items()}
-    return Record(pooled, traces, clock.ms_per_step(), len(clock.compiled), join(rows), *first)
+    return Record(pooled, traces, worst, clock.ms_per_step(), len(clock.compiled), join(rows), *first)
 
 
 class Clock:
@@ -233,20 +240,20 @@ def summary(suite: Suite, records: dict[str, Record], settings: Settings) -> dic
             "methods": methods}  # fmt: skip
 
 
-def foreign(suite: Suite, given: Sequence[Replies], seed: int) -> dict[str, Any]:
+def foreign(judged: Judged, seed: int) -> dict[str, Any]:
     """The entry of another localizer; what it took for an update it alone knows."""
-    drives = enumerate(episode for _, _, episode in suite.episodes)
-    judged = [judge(said, episode, number) for (number, episode), said in zip(drives, given, strict=True)]
-    pooled = {phase: metrics.pool([runs for j in judged for runs in j[phase]]) for phase in report.PHASES}
-    tables = {phase: metrics.summarize(runs, seed) for phase, runs in pooled.items()}
+    tables = {phase: metrics.summarize(runs, seed) for phase, runs in judged.runs.items()}
     facts = {"ms_per_step": None, "compilations": 0, "estimate": "trajectory"}
     return tables | facts | {"estimates": {"trajectory": tables}}
 
 
-def write_results(folder: Path, suite: Suite, records: dict[str, Record], data: dict[str, Any]) -> None:
-    """Write bench.json, bench.md and the figures."""
+def write_results(
+    folder: Path, suite: Suite, records: dict[str, Record], judged: dict[str, Judged], data: dict[str, Any]
+) -> None:
+    """Write bench.json, bench.md, report.html and the figures."""
     report.write_json(folder / "bench.json", data)
     report.write_text(folder / "bench.md", report.markdown(data))
+    write_view(folder / "report.html", suite, data, {name: found.worst for name, found in judged.items()})
     runs = {name: record.runs[judged_by(name)] for name, record in records.items()}
     traces = [{name: record.traces[n] for name, record in records.items()} for n in range(len(suite.episodes))]
     moved = [np.asarray(episode.kidnapped) for _, _, episode in suite.episodes]
@@ -280,13 +287,18 @@ def main() -> None:
     bar, advance = progress_bar(len(methods) * len(suite.episodes))
     with bar:
         records = collect(suite, methods, settings, advance, trained)
-    data = summary(suite, records, settings)
-    data["methods"] |= {name: foreign(suite, given, args.seed) for name, given in others.items()}
+    judged = {name: Judged(record.runs[judged_by(name)], record.worst) for name, record in records.items()}
+    judged |= {name: judge_drives([drive.episode for drive in drives], given) for name, given in others.items()}
+    data = summary(suite, records, settings) | {"digests": digests(suite, {kind: folders[kind] for kind in trained})}
+    data["methods"] |= {name: foreign(judged[name], args.seed) for name in others}
+    for name, found in judged.items():
+        data["methods"][name]["by_drive"] = by_drive(found)
     report.print_tables(data)
     if missing:
         print(missing)
     if folder:
-        write_results(folder, suite, records, data)
+        write_results(folder, suite, records, judged, data)
+        report.terminal().print(f"look at {folder / 'report.html'}", soft_wrap=True, highlight=False)
     if folder and args.per_run:
         write_runs(folder / "runs.npz", join([record.table for record in records.values()]))
 

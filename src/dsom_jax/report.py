@@ -3,7 +3,9 @@
 ``bench.json`` holds, beside what was asked for, ``methods``: NAME -> {"global": M, "kidnap": M, "ms_per_step",
 "compilations", "estimate", "estimates"}. M is :func:`.judging.metrics.summarize`; ``ms_per_step`` is the time of one
 update of all runs together; ``compilations`` counts the shapes of map and episode that were compiled; ``estimate`` says
-whether M judges the weighted ``mean`` or the heaviest ``cluster``, and ``estimates`` has M for both.
+whether M judges the weighted ``mean`` or the heaviest ``cluster``, and ``estimates`` has M for both. ``by_drive``
+(:func:`.judging.by_drive.by_drive`) lists the drives one by one, each with its worst run; ``digests`` tells maps, drives
+and networks from others of the same name.
 Values that do not exist (a mean over no runs) are null. ``runs.npz`` (``--per-run``) holds the columns of
 :class:`dsom_jax.judging.run_table.RunTable`, one row for every run.
 """
@@ -29,8 +31,11 @@ from dsom_jax.errors import UserError
 PHASES = {"global": "Global localization", "kidnap": "Kidnapping"}
 
 
-def output_folder(path: str | Path) -> Path:
-    """``path`` as a folder that exists and takes files; UserError otherwise. Call it before any work is done."""
+def output_folder(path: str | Path, option: str = "--out") -> Path:
+    """``path`` as a folder that exists and takes files; UserError otherwise, in terms of the ``option`` that names it.
+
+    Call it before any work is done.
+    """
     folder = Path(path)
     try:
         new = not folder.exists()
@@ -39,7 +44,7 @@ def output_folder(path: str | Path) -> Path:
             pass
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error)
-        raise UserError(f"--out {folder}: cannot write there ({reason}): name a folder that can be written") from None
+        raise UserError(f"{option} {folder}: cannot write there ({reason}): name a folder that can be written") from None
     if new:
         atexit.register(_remove_empty, folder)
     return folder
@@ -123,7 +128,7 @@ def table(report: dict[str, Any], phase: str) -> Table:
 def print_tables(report: dict[str, Any], console: Console | None = None) -> None:
     """Print one table per phase that was run; 100 columns where the output is no terminal."""
     console = console or terminal()
-    for phase in _phases(report):
+    for phase in phases_of(report):
         console.print(table(report, phase), "")
     console.print(LEGEND, style="dim", highlight=False)
 
@@ -137,7 +142,7 @@ def terminal(stderr: bool = False) -> Console:
 def markdown(report: dict[str, Any]) -> str:
     """The same tables for a README."""
     blocks = []
-    for phase in _phases(report):
+    for phase in phases_of(report):
         head = ["method", *COLUMNS]
         rule = ["---", *["---:"] * len(COLUMNS)]
         rows = [[f"`{name}`", *_cells(entry, phase, intervals=True)] for name, entry in report["methods"].items()]
@@ -146,7 +151,7 @@ def markdown(report: dict[str, Any]) -> str:
     return "\n\n".join(blocks) + "\n"
 
 
-def _phases(report: dict[str, Any]) -> list[str]:
+def phases_of(report: dict[str, Any]) -> list[str]:
     """The phases in which at least one experiment was made."""
     entries = report["methods"].values()
     return [phase for phase in PHASES if any(entry[phase]["experiments"] for entry in entries)]

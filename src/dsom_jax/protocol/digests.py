@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
+from dsom_jax import checkpoint
 from dsom_jax.data.suite import Suite
 from dsom_jax.occupancy import OccupancyGrid
 
@@ -31,3 +33,10 @@ def map_digest(grid: OccupancyGrid) -> str:
 def clips_digest(suite: Suite) -> str:
     """Of all scans, poses and kidnappings: changes with the logs, their references and how clips are chosen."""
     return digest(*(part for _, _, clip in suite.episodes for part in (clip.ranges, clip.poses, clip.kidnapped)))
+
+
+def digests(suite: Suite, networks: Mapping[str, Any]) -> dict[str, Any]:
+    """``digests`` of ``bench.json``: maps and drives of a suite, and the folders of the ``networks`` by kind."""
+    maps = {where: map_digest(grid) for where, grid, _ in suite.episodes}
+    used = {kind: checkpoint.digest(folder) for kind, folder in networks.items()}
+    return {"maps": maps, "drives": clips_digest(suite), "networks": used}

@@ -11,6 +11,7 @@ import numpy as np
 
 from dsom_jax.data.files import FAR
 from dsom_jax.data.log import limit_ranges
+from dsom_jax.data.ros2_messages import covariance36 as covariance36
 from dsom_jax.data.tf_tree import Mount, planar, stamp_of
 from dsom_jax.data.trajectory import yaw_of
 from dsom_jax.errors import UserError
@@ -163,10 +164,3 @@ def set_transform(message: Any, parent: str, child: str, pose: np.ndarray, at: f
     x, y, yaw = (float(v) for v in pose)
     message.transform.translation.x, message.transform.translation.y = x, y
     message.transform.rotation.z, message.transform.rotation.w = math.sin(yaw / 2), math.cos(yaw / 2)
-
-
-def covariance36(covariance: np.ndarray) -> np.ndarray:
-    """(36,) row-major covariance over (x, y, z, roll, pitch, yaw) of one over (x, y, yaw)."""
-    full = np.zeros((6, 6))
-    full[np.ix_([0, 1, 5], [0, 1, 5])] = covariance
-    return full.reshape(-1)

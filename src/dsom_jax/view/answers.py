@@ -59,10 +59,16 @@ def particle_weights(kept: Any) -> np.ndarray:
 
 def spread(poses: np.ndarray, particles: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """(T, 3) standard deviations around ``poses`` (T, 3) of the particles in their cluster, of all if it has none."""
+    return np.sqrt(np.diagonal(covariances(poses, particles, weights), axis1=1, axis2=2))
+
+
+def covariances(poses: np.ndarray, particles: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """(T, 3, 3) of (x, y, theta) around ``poses``, of the same particles: m^2, m rad, rad^2."""
     gap = _gap(particles, poses[:, None])
     near = weights * _close(gap)
     used = np.where(near.sum(1, keepdims=True) > 0, near, weights)
-    return np.sqrt((used[..., None] * gap**2).sum(1) / np.maximum(used.sum(1), 1e-30)[:, None])
+    used = used / np.maximum(used.sum(1, keepdims=True), 1e-30)
+    return np.asarray(np.einsum("tp,tpi,tpj->tij", used, gap, gap))
 
 
 def _gap(poses: np.ndarray, centre: np.ndarray) -> np.ndarray:

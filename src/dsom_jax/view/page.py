@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from html import escape
 from importlib.resources import files
 from pathlib import Path
@@ -26,13 +27,21 @@ def render(story: Story) -> str:
     """HTML of a story."""
     # What ends a script element must not stand in it.
     data = json.dumps(pack(story), separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+    main = (_player(story), _lookalikes(story), _tables(story), _findings(story),
+            numbers("Every number", story.summary), numbers("Settings", story.settings))  # fmt: skip
+    scripts = f'<script type="application/json" id="story">{data}</script>\n<script>{_part("page.js")}</script>'
+    skip = ("player", "Skip to the drive")
+    return document(story.title, story.plan.name, story.headline, main, skip, _tiles(story), scripts)
+
+
+def document(
+    title: str, kicker: str, headline: str, main: Sequence[str], skip: tuple[str, str], tiles: str = "", scripts: str = ""
+) -> str:
+    """HTML of any page; ``main`` are its parts, ``skip`` the part to skip to and the words of that link."""
     return Template(_part("page.html")).substitute(
-        css=_part("page.css"), script=_part("page.js"), data=data,
-        title=escape(story.title), kicker=escape(story.plan.name),
-        headline=escape(story.headline).replace(" %", "\u00a0%"),
-        tiles=_tiles(story), player=_player(story), lookalikes=_lookalikes(story), tables=_tables(story),
-        findings=_findings(story), numbers=_numbers("Every number", story.summary),
-        settings=_numbers("Settings", story.settings),
+        css=_part("page.css"), title=escape(title), kicker=escape(kicker),
+        headline=escape(headline).replace(" %", "\u00a0%"), tiles=tiles, main="\n".join(main),
+        target=skip[0], skip=escape(skip[1]), scripts=scripts,
     )  # fmt: skip
 
 
@@ -121,11 +130,11 @@ def _findings(story: Story) -> str:
     return f"<section><h2>Findings</h2>{f'<ul class=findings>{items}</ul>' if items else none}</section>"
 
 
-def _numbers(title: str, numbers: dict[str, Any]) -> str:
+def numbers(title: str, values: dict[str, Any]) -> str:
     """All scalars of a dictionary, folded away; nested ones with a dot."""
     rows = "".join(
         f'<tr><th scope="row">{escape(key)}</th><td data-number="{escape(key)}">{escape(str(value))}</td></tr>'
-        for key, value in _flat(numbers)
+        for key, value in _flat(values)
     )
     table = f'<table class="plain"><tbody>{rows}</tbody></table>'
     return f"<section><details><summary>{title}</summary>{table}</details></section>" if rows else ""

@@ -29,8 +29,8 @@ def trajectory_figure(plan: Plan, drive: DriveStory) -> Figure:
     corners = plan.corners()
     axes[0].set(xlim=(corners[:, 0].min(), corners[:, 0].max()), ylim=(corners[:, 1].min(), corners[:, 1].max()))
     if judged:
-        axes[0].plot(*_broken(drive.truth, drive.kidnapped).T, "--", color=TRUTH, linewidth=1.5, label="reference")
-    axes[0].plot(*_broken(drive.estimates, drive.kidnapped).T, color=ESTIMATE, linewidth=2, label="estimate")
+        axes[0].plot(*broken(drive.truth, drive.kidnapped).T, "--", color=TRUTH, linewidth=1.5, label="reference")
+    axes[0].plot(*broken(drive.estimates, drive.kidnapped).T, color=ESTIMATE, linewidth=2, label="estimate")
     axes[0].plot(*drive.estimates[0, :2], "o", color=ESTIMATE, label="first answer")
     axes[0].set_title(drive.name)
     _over_updates(axes[1], drive, drive.p_lost, CERTAIN, LOST, "P(lost)")
@@ -53,7 +53,7 @@ def _over_updates(ax: Axes, drive: DriveStory, values: np.ndarray, limit: float,
     ax.set(ylabel=label, xlim=(0, max(len(values) - 1, 1)))
 
 
-def _broken(poses: np.ndarray, kidnapped: np.ndarray) -> np.ndarray:
+def broken(poses: np.ndarray, kidnapped: np.ndarray) -> np.ndarray:
     """(n, 2) the path through ``poses`` (T, 3), with a gap wherever the robot was carried or the answer jumped."""
     xy = np.asarray(poses, float)[:, :2]
     jumps = np.r_[False, np.hypot(*np.diff(xy, axis=0).T) > _JUMP] | np.asarray(kidnapped, bool)
