@@ -3,8 +3,9 @@
     python experiments/trust/measure.py --only clean half wrong --runs 10
 
 Every case is localized with a verdict (``adam_robust`` on the belief over the grid, 500 particles, 8 segments of 60
-updates); rows go to ``results.json``, one for each case, and are retained when the series goes on. The row ``all`` says
-how good ``p_lost`` is over every answer of every case, and over those of real logs alone.
+updates); rows go to ``results.json``, one for each case, and are retained when the series goes on; ``MEASURED.md``
+beside it is their table. The row ``all`` says how good ``p_lost`` is over every answer of every case, and over those of
+real logs alone.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ from dsom_jax.judging.trust import auroc, ece
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.montecarlo import run, run_keys
 from dsom_jax.occupancy import OccupancyGrid, cell_index, lookup
-from dsom_jax.report import write_json
+from dsom_jax.report import write_json, write_text
 from dsom_jax.simulate.drive import DriveConfig, make_synthetic
 
 HERE = Path(__file__).parent
@@ -129,6 +130,32 @@ def main() -> None:
         print(f"{name:44}", {k: v for k, v in rows[name].items() if v is not None},
               f"{time.perf_counter() - began:.0f} s", flush=True)  # fmt: skip
         write_json(args.out, rows)
+        write_text(args.out.with_name("MEASURED.md"), table(rows))
+
+
+COLUMNS = {
+    "wrong": "wrong", "certain": "localized", "false_confident": "false-confident",
+    "certain_when_found": "localized after convergence", "certain_on_map": "localized on mapped ground",
+    "left_in_2": "left within 2 updates of a kidnapping", "strict": "strict", "even": "equal places equal",
+}  # fmt: skip
+"""Shares of a row, and what they are called in the table."""
+
+
+def table(rows: dict[str, Any]) -> str:
+    """Markdown of all rows."""
+    lines = ["# Verdicts, measured", "", "Written by `python experiments/trust/measure.py`; do not edit.", ""]
+    for scope, good in rows.get("all", {}).items():
+        numbers = f"AUROC {good['auroc']:.3f}, ECE {good['ece']:.3f}"
+        lines.append(f"- `p_lost` over {scope}, {good['answers']} answers: {numbers}")
+    heads = ("case", "runs", *COLUMNS.values(), "first localized", "error m")
+    lines += ["", "In percent.", "", "| " + " | ".join(heads) + " |"]
+    lines.append("| --- |" + " ---: |" * (len(COLUMNS) + 3))
+    for name, row in rows.items():
+        if name != "all":
+            shares = [f"{100 * row[c]:.1f}" if row[c] is not None else "" for c in COLUMNS]
+            rest = [f"{row['first_localized']:.1f}", "" if row["error"] is None else f"{row['error']:.3f}"]
+            lines.append(f"| {name} | {row['runs']} | " + " | ".join([*shares, *rest]) + " |")
+    return "\n".join(lines) + "\n"
 
 
 def every(args: Args) -> Iterator[Case]:
