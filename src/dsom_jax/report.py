@@ -4,8 +4,8 @@
 "compilations", "estimate", "estimates"}. M is :func:`.judging.metrics.summarize`; ``ms_per_step`` is the time of one
 update of all runs together; ``compilations`` counts the shapes of map and episode that were compiled; ``estimate`` says
 whether M judges the weighted ``mean`` or the heaviest ``cluster``, and ``estimates`` has M for both. ``by_drive``
-(:func:`.judging.by_drive.by_drive`) lists the drives one by one, each with its worst run; ``digests`` tells maps, drives
-and networks from others of the same name.
+(:func:`.judging.by_drive.by_drive`) lists the drives, each with its worst run; ``digests`` tells maps, drives and
+networks from others of the same name.
 Values that do not exist (a mean over no runs) are null. ``runs.npz`` (``--per-run``) holds the columns of
 :class:`dsom_jax.judging.run_table.RunTable`, one row for every run.
 """
@@ -16,7 +16,7 @@ import atexit
 import json
 import math
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -44,7 +44,8 @@ def output_folder(path: str | Path, option: str = "--out") -> Path:
             pass
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error)
-        raise UserError(f"{option} {folder}: cannot write there ({reason}): name a folder that can be written") from None
+        fix = "name a folder that can be written"
+        raise UserError(f"{option} {folder}: cannot write there ({reason}): {fix}") from None
     if new:
         atexit.register(_remove_empty, folder)
     return folder
@@ -151,7 +152,7 @@ def markdown(report: dict[str, Any]) -> str:
     return "\n\n".join(blocks) + "\n"
 
 
-def phases_of(report: dict[str, Any]) -> list[str]:
+def phases_of(report: Mapping[str, Any]) -> list[str]:
     """The phases in which at least one experiment was made."""
     entries = report["methods"].values()
     return [phase for phase in PHASES if any(entry[phase]["experiments"] for entry in entries)]

@@ -35,7 +35,13 @@ def render(story: Story) -> str:
 
 
 def document(
-    title: str, kicker: str, headline: str, main: Sequence[str], skip: tuple[str, str], tiles: str = "", scripts: str = ""
+    title: str,
+    kicker: str,
+    headline: str,
+    main: Sequence[str],
+    skip: tuple[str, str],
+    tiles: str = "",
+    scripts: str = "",
 ) -> str:
     """HTML of any page; ``main`` are its parts, ``skip`` the part to skip to and the words of that link."""
     return Template(_part("page.html")).substitute(
