@@ -229,7 +229,8 @@ def measure(case: Case, runs: int) -> tuple[dict[str, Any], np.ndarray]:
     judged = [judge(case, n, run(filter, e, run_keys(0, n, runs)).info, e) for n, e in enumerate(case.episodes)]
     pooled = {name: [part for j in judged if (part := j[name]) is not None] for name in judged[0]}
     said = np.stack([np.concatenate(pooled.pop("p_lost")), np.concatenate(pooled["wrong"])], -1)
-    return {name: round(float(np.mean(np.concatenate(v))), 4) if v else None for name, v in pooled.items()}, said
+    values = {name: np.concatenate(parts) if parts else np.empty(0) for name, parts in pooled.items()}
+    return {name: round(float(v.mean()), 4) if v.size else None for name, v in values.items()}, said
 
 
 def judge(case: Case, number: int, info: Any, episode: Episode) -> dict[str, np.ndarray | None]:
