@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import made_bench
 import made_story
 from browser import AXE, needs_axe, needs_browser, opened, resize, theme
-from dsom_jax.view import write_page
+from dsom_jax.view import benched, write_page
 
 pytestmark = needs_browser
 
@@ -31,8 +32,24 @@ def chromium():
         yield driver
 
 
+@pytest.fixture(scope="module")
+def bench_address(tmp_path_factory):
+    path, (suite, _, data, worst) = tmp_path_factory.mktemp("bench") / "report.html", made_bench.made()
+    benched.write_view(path, suite, data, worst)
+    return path.as_uri()
+
+
 @pytest.fixture
 def page(chromium, address):
+    yield from visited(chromium, address)
+
+
+@pytest.fixture
+def bench_page(chromium, bench_address):
+    yield from visited(chromium, bench_address)
+
+
+def visited(chromium, address):
     resize(chromium, 1280, 800)
     theme(chromium, "light")
     chromium.get("about:blank")
@@ -173,6 +190,32 @@ def test_keys(page):
     assert page.find_element("id", "slider").get_attribute("aria-valuetext") == "update 1 of 120, lost"
 
 
+def test_worst_runs_of_bench(bench_page):
+    """A link in the table leads to the picture of the drive, which is drawn, and has the colours of the theme."""
+    link = bench_page.find_elements("css selector", "tbody a[href^='#worst-']")[4]
+    place = link.get_attribute("href").split("#")[1]
+    link.click()
+    chosen = bench_page.find_element("css selector", "li:target")
+    top = bench_page.execute_script("return arguments[0].getBoundingClientRect().top", chosen)
+    assert chosen.get_attribute("id") == place and 0 <= top < 700
+    shades = {}
+    for colours in ("light", "dark"):
+        theme(bench_page, colours)
+        shot = np.asarray(
+            Image.open(io.BytesIO(chosen.find_element("tag name", "svg").screenshot_as_png)).convert("RGB")
+        )
+        shades[colours] = shot.astype(int)
+    red, blue = ((np.abs(shades["light"] - colour).sum(-1) < 40).sum() for colour in ([179, 38, 30], [11, 92, 173]))
+    assert red > 50 and blue > 20
+    assert shades["light"].mean() > 180 > 90 > shades["dark"].mean()
+
+
+@pytest.mark.parametrize("width", [1280, 390])
+def test_bench_is_no_wider_than_the_screen(bench_page, width):
+    resize(bench_page, width, 844)
+    assert bench_page.execute_script("return document.documentElement.scrollWidth") <= width
+
+
 @pytest.mark.parametrize("width", [1280, 390])
 def test_nothing_is_wider_than_the_screen(page, width):
     resize(page, width, 844)
@@ -199,7 +242,9 @@ def test_prints_on_white(page):
 
 @needs_axe
 @pytest.mark.parametrize("colours", ["light", "dark"])
-def test_axe_finds_nothing(page, colours):
+@pytest.mark.parametrize("kind", ["page", "bench_page"])
+def test_axe_finds_nothing(request, kind, colours):
+    page = request.getfixturevalue(kind)
     theme(page, colours)
     time.sleep(0.3)  # colours that fade over are judged once they are there
     page.execute_script(AXE.read_text())

@@ -46,8 +46,8 @@ def render(suite: Suite, data: Mapping[str, Any], worst: Mapping[str, Sequence[W
     main = (
         _drawn_once(suite, _most(suite, worst)),
         f'<div id="methods" tabindex="-1">{"".join(_methods(data, phase) for phase in report.phases_of(data))}'
-        f'<p class="caption">{LEGEND}</p></div>',
-        _rows(data),
+        f'<p class="caption below">{LEGEND}</p></div>',
+        f'{_rows(data)}<p class="caption below">{HOW}</p>',
         *(_drive(suite, data, worst, number) for number in range(len(suite.episodes))),
         numbers("What ran", {name: value for name, value in data.items() if name != "methods"}),
     )
@@ -85,8 +85,9 @@ def _number(data: Any, keys: Sequence[Any], kind: str, tag: str = "b") -> str:
 def _cell(data: Any, keys: Sequence[Any], kind: str) -> str:
     """A number and its interval, if it has one."""
     interval = [*keys[:-1], INTERVALS.get(keys[-1], f"{keys[-1]}_ci95")]
-    bounds = data["methods"][keys[1]][keys[2]].get(interval[-1])
-    if not bounds or None in bounds:
+    entry = data["methods"][keys[1]][keys[2]]
+    bounds = entry.get(interval[-1]) or [None]
+    if entry[keys[-1]] is None or None in bounds:
         return f"<td>{_number(data, keys, kind)}</td>"
     low, high = (_number(data, [*interval, n], kind, "span") for n in (0, 1))
     return f"<td>{_number(data, keys, kind)}<small>[{low} to {high}]</small></td>"
@@ -157,9 +158,9 @@ def _drive_cells(data: Mapping[str, Any], name: str, number: int, phases: Sequen
     keys = ("methods", name, "by_drive", number)
     yield f'<a href="#drive-{number + 1}">{number + 1}</a>'
     for phase in phases:
-        yield _number(data, (*keys, phase, "converged"), "percent")
-        yield _number(data, (*keys, phase, "e_pos_m"), "metres")
-    yield _number(data, (*keys, "worst", "right"), "percent")
+        yield _number(data, (*keys, phase, "converged"), "percent", "span")
+        yield _number(data, (*keys, phase, "e_pos_m"), "metres", "span")
+    yield _number(data, (*keys, "worst", "right"), "percent", "span")
     yield _link(data, name, number)
 
 
@@ -199,7 +200,7 @@ def _drive(suite: Suite, data: Mapping[str, Any], worst: Mapping[str, Sequence[W
             f"<figcaption>{_caption(data, name, number)}</figcaption></figure></li>"
         )
     return (f'<section id="drive-{number + 1}"><h2>Drive {number + 1}: the worst run of each method</h2>'
-            f'<p class="caption">Map {escape(where)}, {len(moved)} updates{carried}. {HOW}</p>{KEYS}'
+            f'<p class="caption">Map {escape(where)}, {len(moved)} updates{carried}.</p>{KEYS}'
             f'<ul class="worst">{"".join(items)}</ul></section>')  # fmt: skip
 
 
