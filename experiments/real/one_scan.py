@@ -20,6 +20,7 @@ from run import Args as Series
 
 from dsom_jax import checkpoint, localize, localize_args, report
 from dsom_jax.data import RawLog, load_log, load_ros_map
+from dsom_jax.data.log import limited
 from dsom_jax.errors import UserError, run_cli
 from dsom_jax.filters.methods import make_proposal
 from dsom_jax.filters.settings import DRAWN, REAL
@@ -68,7 +69,7 @@ def judge(name: str, args: Args, folder: Path) -> dict[str, dict[str, float]]:
     """Quality of every proposal on one log, printed as it comes."""
     place, kept = LOGS[name]
     options = localize_args.Args(map=args.data / place / "map.yaml", log=args.data / kept / "log.clf.gz", out=args.out)
-    grid, log = load_ros_map(options.map), localize.limited(load_log(options.log), options.laser_max_range)
+    grid, log = load_ros_map(options.map), limited(load_log(options.log), options.laser_max_range)
     ranges, poses = scans(options, log)
     found = {}
     for label, proposal in proposals(name, grid, log, folder):
