@@ -42,6 +42,9 @@ from dsom_jax.montecarlo import run, run_keys
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.summary_table import print_summary, reference_notes
 from dsom_jax.view.localized import write_view
+from dsom_jax.view.recording import ready, write_mcap
+from dsom_jax.view.rerun_file import write_rerun
+from dsom_jax.view.story import DriveStory
 
 
 def main() -> None:
@@ -72,6 +75,7 @@ def answer(args: Args, carried: Sequence[float] = ()) -> dict[str, Any]:
     on_plan = carried_over(drives, args.reference_on_plan)
     network = load_network(args, log.lidar)
     folder = report.output_folder(args.out)
+    ready(args.mcap, args.rerun, drives)
     with stage("expected ranges from every place of the map"):
         filter = jax.block_until_ready(build(args, grid, log.lidar, network))
     outcomes, latency = driven(filter, grid, log.lidar, drives, args)
@@ -84,8 +88,19 @@ def answer(args: Args, carried: Sequence[float] = ()) -> dict[str, Any]:
     with stage("writing the page"):
         report.write_json(folder / "summary.json", summary)
         save_estimate(folder / "estimate.tum", drives, given)
-        write_view(folder, outcomes, grid, log.lidar, summary, findings, notes + later, args)
+        shown = write_view(folder, outcomes, grid, log.lidar, summary, findings, notes + later, args)
+    record(shown, grid, log.lidar, args)
     return summary
+
+
+def record(shown: Sequence[DriveStory], grid: OccupancyGrid, lidar: LidarConfig, args: Args) -> None:
+    """Write the drives that the page shows as the recordings that are asked for."""
+    if args.mcap:
+        with stage("writing the recording for Foxglove and ROS 2"):
+            write_mcap(args.mcap, grid, lidar, shown)
+    if args.rerun:
+        with stage("writing the recording for Rerun"):
+            write_rerun(args.rerun, grid, lidar, shown)
 
 
 class Read(NamedTuple):

@@ -17,6 +17,7 @@ from dsom_jax.filters.settings import DRAWN, REAL, sharp_powers, with_motion, wi
 from dsom_jax.judging.scores import judged_by
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.occupancy import OccupancyGrid
+from dsom_jax.view.rerun_file import load_rerun
 
 
 @dataclass(frozen=True)
@@ -79,6 +80,10 @@ class Args:
     """Seed of all randomness."""
     json: bool = False
     """Print summary.json instead of a table."""
+    mcap: Path | None = None
+    """FILE.mcap: besides, run 0 as a recording that Foxglove and ROS 2 play: map, scans, answers, particles."""
+    rerun: Path | None = None
+    """FILE.rrd: the same for the Rerun viewer; needs `pip install 'dsom-jax[rerun]'`."""
 
 
 MANY = 1_000_000
@@ -100,6 +105,7 @@ def check(args: Args) -> None:
     if not 0 < args.t_cut < 1:
         raise UserError(f"--t-cut {args.t_cut}: give a number between 0 and 1 (the paper uses 0.6)")
     check_network(args)
+    check_recordings(args)
     if args.kidnap and args.segments < 2:
         raise UserError(f"--segments {args.segments}: --kidnap joins two segments, give at least 2")
 
@@ -112,6 +118,17 @@ def check_network(args: Args) -> None:
         chosen = f"--method {args.method}" if args.method.startswith("mcl") else f"--proposal {args.proposal}"
         fix = "leave it out, or give --proposal dsom or hybrid and a --method other than mcl"
         raise UserError(f"--checkpoint {args.checkpoint}: has no use with {chosen}; {fix}")
+
+
+def check_recordings(args: Args) -> None:
+    """UserError if a recording is to be a folder, or a file that its player would not take, or cannot be made."""
+    for option, path, suffix in (("--mcap", args.mcap, ".mcap"), ("--rerun", args.rerun, ".rrd")):
+        if path is not None and path.suffix.lower() != suffix:
+            raise UserError(f"{option} {path}: name a file that ends in {suffix}")
+        if path is not None and path.is_dir():
+            raise UserError(f"{option} {path}: is a folder; name a file")
+    if args.rerun:
+        load_rerun()
 
 
 def drawn_from(args: Args) -> str:

@@ -38,9 +38,10 @@ def write_view(
     findings: Sequence[diagnosed.Finding],
     notes: Sequence[str],
     settings: Any,
-) -> None:
-    """``answers.csv``, ``trajectory.png`` and ``report.html``; ``settings`` are the arguments of the command line.
+) -> tuple[DriveStory, ...]:
+    """``answers.csv``, ``trajectory.png`` and ``report.html``, which shows the drives that are returned.
 
+    ``settings`` are the arguments of the command line.
     The page names the ``findings`` by their severity, then the ``notes``. The outcomes keep the states of all updates
     (``montecarlo.run(..., keep=range(T))``).
     """
@@ -49,6 +50,7 @@ def write_view(
     write_answers(folder / "answers.csv", said)
     save_figure(trajectory_figure(story.plan, story.drives[0]), folder / "trajectory.png")
     write_page(folder / "report.html", story)
+    return story.drives
 
 
 def remarks(findings: Sequence[diagnosed.Finding], notes: Sequence[str]) -> tuple[Finding, ...]:
