@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from dataclasses import dataclass, field
@@ -165,6 +166,32 @@ def test_command_line(suite, monkeypatch, tmp_path, capsys):
         "bench.json", "bench.md", "report.html", "position_error.png", "converging_steps.png", "error_evolution.png",
         "map_mcl.png", "map_robust_likelihood_grid.png",
     }  # fmt: skip
+
+
+def test_the_page_has_the_numbers_and_the_worst_runs(suite, monkeypatch, tmp_path, capsys):
+    methods = "mcl,adam_likelihood_grid,robust_likelihood_grid"
+    command(monkeypatch, "--methods", methods, "--out", str(tmp_path), "--per-run")
+    assert f"look at {tmp_path / 'report.html'}" in capsys.readouterr().out.splitlines()
+    data, html = json.loads((tmp_path / "bench.json").read_text()), (tmp_path / "report.html").read_text()
+    marked = re.findall(r'data-key="([^"]+)" data-value="([^"]+)"', html)
+    for key, value in marked:
+        held: Any = data
+        for part in key.split("."):
+            held = held[int(part)] if isinstance(held, list) else held[part]
+        assert float(value) == held
+    assert len(marked) > 3 * 2 * 5 and len(data["digests"]["drives"]) == 12 and data["digests"]["networks"] == {}
+    table = read_runs(tmp_path / "runs.npz")
+    for method, entry in data["methods"].items():
+        for n, part in enumerate(entry["by_drive"]):
+            rows = table.rows((table.method == method) & (table.sequence == n))
+            for phase in ("global", "kidnap"):
+                assert part[phase]["converged"] == rows.converged[rows.phase == phase].mean()
+            ends = rows.e_pos_m[rows.phase == "kidnap"]
+            assert part["worst"]["e_pos_m"] == pytest.approx(ends[part["worst"]["run"]])
+            # Runs of this suite are right at the same updates: the worst is the one that ends farthest off.
+            assert part["worst"]["e_pos_m"] == pytest.approx(ends.max())
+    late = data["methods"]["adam_likelihood_grid"]["by_drive"][0]["worst"]
+    assert late["right"] == (STEPS - 2 * 3) / STEPS
 
 
 def test_per_run_values_are_those_of_the_table(suite, monkeypatch, tmp_path):
