@@ -187,7 +187,7 @@ def test_arrays_are_bounded_and_hold_no_objects(tmp_path):
         header = b"{'descr': '<f8', 'fortran_order': False, 'shape': (100000000000,), }".ljust(117) + b"\n"
         archive.writestr("a.npy", b"\x93NUMPY\x01\x00\x76\x00" + header)
     for wrong in (stored.getvalue(), huge.getvalue(), b"not a zip", b""):
-        with pytest.raises(UserError, match="not a table"):
+        with pytest.raises(UserError, match="table: not readable"):
             read_arrays(wrong, "table")
 
 
