@@ -149,6 +149,38 @@ def test_the_other_lidar_is_dropped_and_reported(tmp_path: Path) -> None:
     assert log.report.counts["scans of 7 beams dropped, the log's lidar has 5"] == 1
 
 
+def wall(bearings: np.ndarray) -> list[float]:
+    """Metres of a round wall by bearing; it changes by at most 1 m a radian."""
+    return np.round(3 + np.sin(bearings), 4).tolist()
+
+
+def test_scans_whose_number_of_beams_varies(tmp_path: Path) -> None:
+    """FLASER spans -90 to 90 deg: a beam is the nearest one of its scan, at most three quarters of one off."""
+    counts = np.random.default_rng(0).integers(165, 180, 60)
+    lines = [flaser(wall(np.linspace(-np.pi / 2, np.pi / 2, n)), odom=(0.1 * t, 0, 0), laser=(0.1 * t, 0, 0.1), stamp=t)
+             for t, n in enumerate(counts, 1)]  # fmt: skip
+    log = load_carmen(write(tmp_path, lines))
+    assert len(log) == 60 and list(log.report.counts.values()) == [int((counts != log.lidar.beams).sum())]
+    step = log.lidar.angle_increment
+    bearings = log.lidar.angle_min + step * np.arange(log.lidar.beams)
+    # A beam of the scan with the fewest is a tenth wider.
+    np.testing.assert_allclose(log.ranges, np.tile(wall(bearings), (60, 1)), atol=0.75 * 1.1 * step + 1e-4)
+
+
+def test_scans_whose_angles_vary(tmp_path: Path) -> None:
+    """Two thirds begin at -1.0 rad, one third two beams later; what begins elsewhere altogether is another lidar."""
+    starts = [-1.0, -1.0, -0.9] * 4 + [2.0]
+    lines = [robotlaser(wall(a + 0.05 * np.arange(40)), (0, 0, 0), (t, 0, 0), t, f"0 {a} 2.0 0.05 50.0 0.01 0")
+             for t, a in enumerate(starts, 1)]  # fmt: skip
+    log = load_carmen(write(tmp_path, lines))
+    assert len(log) == 12 and log.report.counts["scans of other angles than most dropped"] == 1
+    assert (log.lidar.beams, log.lidar.angle_min, log.lidar.angle_increment) == (40, -1.0, 0.05)
+    late = np.array(starts[:12]) > -1.0
+    np.testing.assert_allclose(log.ranges[~late], np.tile(wall(log.lidar.angles()), (8, 1)), atol=1e-4)
+    assert np.isnan(log.ranges[late][:, :2]).all()
+    np.testing.assert_allclose(log.ranges[late][:, 2:], np.tile(wall(log.lidar.angles()[2:]), (4, 1)), atol=1e-4)
+
+
 def test_odd_stamps_are_reported(tmp_path: Path) -> None:
     other = [2.0, 2.0, 3.0, 4.0, 5.0]
     lines = [flaser(RANGES, stamp=5), flaser(RANGES, stamp=5), flaser(other, stamp=5), flaser(RANGES, stamp=4)]

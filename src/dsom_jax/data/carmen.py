@@ -19,8 +19,10 @@ and is the reference trajectory, as SLAM programs write it, if it does not.
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -30,10 +32,16 @@ from dsom_jax.data.files import read_lines
 from dsom_jax.data.log import RawLog, Report, limit_ranges, majority_beams, rigid_mount, tidy
 from dsom_jax.data.log_options import AS_TOLD, LogOptions
 from dsom_jax.data.odometry import mended, odometry_at
+from dsom_jax.data.scans import TURN, brought_together, differing, onto, table
 from dsom_jax.errors import UserError
 
 WITH_POSE = ("FLASER", "ROBOTLASER1")
 WITHOUT_POSE = ("RAWLASER1", "LASER")
+ALIKE = 0.2
+"""Scans of one lidar differ by at most this share in number and angles of their beams; others are of another lidar."""
+FINEST = 1e-4
+"""Radians between beams; no lidar has less."""
+T = TypeVar("T")
 
 
 @dataclass
@@ -63,10 +71,8 @@ def load_carmen(path: str | Path, options: LogOptions = AS_TOLD, range_max: floa
             f"{path}: holds no FLASER, ROBOTLASER1 or RAWLASER1 line, so it is not a CARMEN log of a front laser"
             + "".join(f"; {line}" for line in messages.report.lines()[:2])
         )
-    keep = majority_beams(messages.ranges, messages.report, path)
-    ranges = np.stack([scan for scan, kept in zip(messages.ranges, keep, strict=True) if kept])
+    keep, ranges, config = _of_one_lidar(messages, path)
     stamps = np.array(messages.stamps)[keep]
-    config = next(c for c, kept in zip(messages.configs, keep, strict=True) if kept)
     odometry, broken, mount, reference = _poses(messages, keep, stamps, path)
     lidar = options.mounted(lidar_of(path, ranges, config, messages.params, mount, range_max))
     if reference is not None:
@@ -139,6 +145,48 @@ def _config(words: list[str]) -> LaserConfig:
     if not np.isfinite([start, resolution]).all():
         raise ValueError("angles")
     return LaserConfig(start, resolution, maximum)
+
+
+def _of_one_lidar(messages: Messages, path: Path) -> tuple[np.ndarray, np.ndarray, LaserConfig]:
+    """Which scans (M,) bool are of the lidar, their ranges (N, B) on the same beams, and the geometry of these."""
+    counts = np.array([len(scan) for scan in messages.ranges])
+    start, step = (np.array([getattr(c, name) for c in messages.configs]) for name in ("start_angle", "resolution"))
+    sound = (np.abs(start) <= TURN) & (np.abs(step) >= FINEST) & (np.abs(step) <= TURN)
+    if not sound.all():  # angles that cannot be tell nothing; meta.yaml may know better
+        keep = majority_beams(messages.ranges, messages.report, path)
+        return keep, np.stack(_chosen(messages.ranges, keep)), _chosen(messages.configs, keep)[0]
+    keep = _alike(counts, start, step, messages.report)
+    chosen, still = _chosen(messages.ranges, keep), np.zeros(int(keep.sum()))
+    last = start + step * (counts - 1)
+    scans = table(chosen, stamps=still, start=start[keep], end=last[keep], step=step[keep], beam_time=still)
+    scans, beams = brought_together(scans, messages.report)
+    ranges = onto(scans, beams).astype(float)
+    for n in np.flatnonzero(~differing(scans, beams)):
+        ranges[n] = chosen[n]  # as they are, not in single precision
+    return keep, ranges, replace(_chosen(messages.configs, keep)[0], start_angle=beams.start, resolution=beams.step)
+
+
+def _chosen(rows: Sequence[T], keep: np.ndarray) -> list[T]:
+    """The rows that are kept."""
+    return [row for row, kept in zip(rows, keep, strict=True) if kept]
+
+
+def _alike(counts: np.ndarray, start: np.ndarray, step: np.ndarray, report: Report) -> np.ndarray:
+    """(M,) bool: scans with about the number of beams and the angles (start and step, radians) of most."""
+    usual = counts[np.argmin(np.abs(counts - np.median(counts)))]
+    near = np.abs(counts - usual) <= ALIKE * usual
+    middle, first = np.median(step[near]), np.median(start[near])
+    turned = np.abs(start - first) > ALIKE * usual * abs(middle)
+    same = near & (np.abs(step - middle) <= ALIKE * abs(middle)) & ~turned
+    if not same.any():
+        same = (counts == counts[near][0]) & (start == start[near][0]) & (step == step[near][0])
+    if not near.all():
+        low, high = counts[~near].min(), counts[~near].max()
+        told = f"{low}" if low == high else f"{low} to {high}"
+        report.add(f"scans of {told} beams dropped, the log's lidar has {usual}", count=int((~near).sum()))
+    if (near & ~same).any():
+        report.add("scans of other angles than most dropped", count=int((near & ~same).sum()))
+    return same
 
 
 def _poses(

@@ -73,8 +73,9 @@ def table(ranges: list[np.ndarray], **columns: np.ndarray) -> Scans:
     """Scans of readings of any lengths; ``columns`` are the other fields."""
     counts = np.array([len(row) for row in ranges])
     padded = np.full((len(ranges), counts.max(initial=0)), np.nan, np.float32)
-    for row, values in zip(padded, ranges, strict=True):
-        row[: len(values)] = values
+    with np.errstate(over="ignore"):  # beyond single precision is beyond any lidar: inf
+        for row, values in zip(padded, ranges, strict=True):
+            row[: len(values)] = values
     return Scans(padded, counts, **columns)
 
 
