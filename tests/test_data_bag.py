@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from dsom_jax.data import LogOptions, load_bag, load_log, se2
+from dsom_jax.data.bag_types import odd_field, standard
 from dsom_jax.errors import UserError
 from fixtures.make_bag import FORMATS, Entry, write_bag
 
@@ -50,6 +51,37 @@ def test_storage_file_without_its_folder(tmp_path: Path, form: str) -> None:
     alone = tmp_path / f"alone.{form}"
     shutil.copy(storage, alone)
     np.testing.assert_array_equal(load_log(alone).ranges, load_log(folder).ranges)
+
+
+@pytest.mark.parametrize(
+    ("msgtype", "fields", "odd"),
+    [
+        ("sensor_msgs/msg/LaserScan", lambda own: own[:5] + own[6:], "scan_time"),
+        ("sensor_msgs/msg/LaserScan", lambda own: [*own[:8], ("ranges", own[5][1]), own[9]], "ranges"),
+        ("sensor_msgs/msg/LaserScan", lambda own: [("header", own[1][1]), *own[1:]], "header"),
+        ("std_msgs/msg/Header", lambda own: [("seq", own[0][1]), *own], ""),
+        ("std_msgs/msg/Header", lambda own: own[:1], "header.frame_id"),
+        ("builtin_interfaces/msg/Time", lambda own: own[:1], "header.stamp.nanosec"),
+        ("std_msgs/msg/Header", None, "header.std_msgs/msg/Header"),
+    ],
+)
+def test_definitions_that_lack_what_is_read(msgtype: str, fields, odd: str) -> None:
+    own = dict(standard())
+    constants, held = own.pop(msgtype)
+    if fields is not None:
+        own[msgtype] = (constants, fields(held))
+    assert odd_field(own, "sensor_msgs/msg/LaserScan") == odd
+    assert odd_field(own, "mine/msg/Other") == ""
+
+
+def test_scans_of_a_definition_without_scan_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    bag = write_bag(tmp_path, "db3", drive())
+    monkeypatch.setattr("dsom_jax.data.bag.odd_field", lambda own, kind: "scan_time" if "LaserScan" in kind else "")
+    with pytest.raises(UserError, match="topic /scan holds no scan"):
+        load_bag(bag)
+    monkeypatch.setattr("dsom_jax.data.bag.odd_field", lambda own, kind: "header")
+    with pytest.raises(UserError, match="topic /scan holds no scan"):
+        load_bag(bag)
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ import numpy as np
 from dsom_jax.data import se2
 from dsom_jax.data.assemble import Sensor, assemble
 from dsom_jax.data.bag_reference import REFERENCES, reference_of
+from dsom_jax.data.bag_types import odd_field
 from dsom_jax.data.documents import read_yaml
 from dsom_jax.data.files import check_file
 from dsom_jax.data.log import RawLog, Report
@@ -237,7 +238,12 @@ def _read(reader: Any, chosen: tuple[str, str | None, str | None], report: Repor
 
 def messages_of_topics(reader: Any, wanted: list[Any], report: Report) -> Iterator[tuple[str, int, Any]]:
     """Topic, time of recording (ns) and message, as far as the bag can be read; what cannot is counted."""
-    stream = reader.messages(connections=wanted)
+    odd = {c.topic: odd_field(reader.typestore.fielddefs, c.msgtype) for c in wanted}
+    for topic, field_name in odd.items():
+        if field_name:
+            report.add(f"unreadable messages on {topic}", f"their definition in the bag lacks {field_name}")
+    sound = [c for c in wanted if not odd[c.topic]]
+    stream = reader.messages(connections=sound) if sound else iter(())  # of no connections rosbags reads all
     while True:
         try:
             connection, received, raw = next(stream)
