@@ -76,10 +76,11 @@ def test_definitions_that_lack_what_is_read(msgtype: str, fields, odd: str) -> N
 
 def test_scans_of_a_definition_without_scan_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bag = write_bag(tmp_path, "db3", drive())
-    monkeypatch.setattr("dsom_jax.data.bag.odd_field", lambda own, kind: "scan_time" if "LaserScan" in kind else "")
+    place = "dsom_jax.data.bag_file.odd_field"
+    monkeypatch.setattr(place, lambda own, kind: "scan_time" if "LaserScan" in kind else "")
     with pytest.raises(UserError, match="topic /scan holds no scan"):
         load_bag(bag)
-    monkeypatch.setattr("dsom_jax.data.bag.odd_field", lambda own, kind: "header")
+    monkeypatch.setattr(place, lambda own, kind: "header")
     with pytest.raises(UserError, match="topic /scan holds no scan"):
         load_bag(bag)
 

@@ -17,7 +17,7 @@ import made_story
 import tiny_world
 from dsom_jax import localize
 from dsom_jax.data import LogOptions, load_log, load_map
-from dsom_jax.data.bag import open_bag
+from dsom_jax.data.bag_file import open_bag
 from dsom_jax.data.tf_tree import planar, stamp_of
 from dsom_jax.errors import UserError, run_cli
 from dsom_jax.judging.scores import Drive

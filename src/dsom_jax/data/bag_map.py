@@ -8,7 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from dsom_jax.data.bag import listed, messages_of_topics, open_bag
+from dsom_jax.data.bag_file import listed, messages_of_topics, open_bag
 from dsom_jax.data.files import check_near
 from dsom_jax.data.log import Report
 from dsom_jax.data.tf_tree import planar

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from dsom_jax.data.bag import SUFFIXES, is_bag, load_bag
+from dsom_jax.data.bag import load_bag
+from dsom_jax.data.bag_file import SUFFIXES, is_bag
 from dsom_jax.data.carmen import load_carmen
 from dsom_jax.data.files import check_path
 from dsom_jax.data.log import RawLog, check_lidar, report_still

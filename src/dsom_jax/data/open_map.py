@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from dsom_jax.data.bag import is_bag
+from dsom_jax.data.bag_file import is_bag
 from dsom_jax.data.bag_map import load_bag_map
 from dsom_jax.data.documents import read_yaml
 from dsom_jax.data.dxf import Drawing, load_drawing

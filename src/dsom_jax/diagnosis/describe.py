@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from dsom_jax.data import se2
-from dsom_jax.data.bag import is_bag, open_bag
+from dsom_jax.data.bag_file import is_bag, open_bag
 from dsom_jax.data.files import read_lines
 from dsom_jax.data.log import RawLog, travelled
 from dsom_jax.occupancy import OccupancyGrid

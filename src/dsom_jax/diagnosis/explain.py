@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dsom_jax.data import se2
-from dsom_jax.data.bag import is_bag
+from dsom_jax.data.bag_file import is_bag
 from dsom_jax.data.log import RawLog
 from dsom_jax.diagnosis import map_fit
 from dsom_jax.diagnosis.ego_motion import Motion, Steps, ego_motion, matched_steps, pieces_of

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dsom_jax.data import se2
-from dsom_jax.data.bag import is_bag
+from dsom_jax.data.bag_file import is_bag
 from dsom_jax.data.documents import read_yaml
 from dsom_jax.data.log import RawLog, travelled
 from dsom_jax.data.ros_map import decode_image, read_map_info

@@ -12,7 +12,7 @@ import yaml
 
 from dsom_jax.atomic import write_atomic
 from dsom_jax.data import LogOptions, RawLog, load_log
-from dsom_jax.data.bag import is_bag
+from dsom_jax.data.bag_file import is_bag
 from dsom_jax.data.documents import read_yaml
 from dsom_jax.data.dxf import UNITS
 from dsom_jax.data.log import limited

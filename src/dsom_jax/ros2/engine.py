@@ -9,16 +9,16 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from dsom_jax.data import se2
 from dsom_jax.errors import UserError
-from dsom_jax.live import Answer, Localizer
+from dsom_jax.live import Localizer
 from dsom_jax.occupancy import OccupancyGrid
+from dsom_jax.ros2.exchange import Counts, Output, Told, Trusted, same
 from dsom_jax.ros2.messages import Scan, fitted, lidar_of
 from dsom_jax.ros2.parameters import Parameters, settings_of
 from dsom_jax.ros2.transforms import Transforms
@@ -28,54 +28,6 @@ _WAITING = 20
 _TILT = np.radians(5.0)
 _NAV2_COVARIANCE = np.diag([0.25, 0.25, 0.06853891909])
 """Of an initial pose from parameters, as in nav2_amcl (m2, m2, rad2)."""
-
-
-class Output(NamedTuple):
-    """What one scan led to.
-
-    Attributes:
-        answer: where the robot is.
-        map_to_odom: (3,) pose of the odometry frame in the map, or None while there is none to be trusted.
-        beams: valid ranges of the scan.
-        latency: seconds from the arrival of the scan to the answer.
-    """
-
-    answer: Answer
-    map_to_odom: np.ndarray | None
-    beams: int
-    latency: float
-
-
-@dataclass
-class Counts:
-    """What became of the scans so far, and the latencies (s) of the last hundred answers."""
-
-    received: int = 0
-    answered: int = 0
-    updated: int = 0
-    dropped: int = 0
-    latencies: deque[float] = field(default_factory=lambda: deque(maxlen=100))
-
-
-class Told(NamedTuple):
-    """An initial pose (3,) and its covariance (3, 3).
-
-    Attributes:
-        stamp: when the robot was there; 0 means now.
-        odometry: (3,) pose of the odometry then, if that was known when the pose came.
-    """
-
-    pose: np.ndarray
-    covariance: np.ndarray
-    stamp: float
-    odometry: np.ndarray | None = None
-
-
-class Trusted(NamedTuple):
-    """Where the odometry frame lies in the map (3,), right whatever the robot drives, and the pose's covariance."""
-
-    map_to_odom: np.ndarray
-    covariance: np.ndarray
 
 
 class Engine:
@@ -343,10 +295,3 @@ class Engine:
         if text != self._complained:
             self._complained = text
             self._say("warn", text)
-
-
-def same(a: OccupancyGrid, b: OccupancyGrid) -> bool:
-    """Whether two maps are equal, cell by cell: a map server sends its map again when it is activated again."""
-    if (a.shape, a.resolution) != (b.shape, b.resolution):
-        return False
-    return all(np.array_equal(getattr(a, name), getattr(b, name)) for name in ("origin", "occupied", "free"))

@@ -29,7 +29,8 @@ from dsom_jax.errors import UserError
 from dsom_jax.live import Answer
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.ros2 import messages
-from dsom_jax.ros2.engine import Engine, Output
+from dsom_jax.ros2.engine import Engine
+from dsom_jax.ros2.exchange import Output
 from dsom_jax.ros2.parameters import NAMES, Parameters, changed, understood
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL, reliability=ReliabilityPolicy.RELIABLE)
