@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dsom_jax.view import DriveStory, Finding, Hypotheses, Plan, Story
+from dsom_jax.view import DriveHypotheses, DriveStory, Plan, Remark, Story
 
 UPDATES, PARTICLES, BEAMS = 120, 500, 180
 CARRIED = 61
@@ -50,7 +50,7 @@ def drive(name: str = "segment 1", seed: int = 0, updates: int = UPDATES, refere
     ranges[:, ::11] = np.inf
     known = truth if reference else np.full_like(truth, np.nan)
     return DriveStory(name, 100.0 + 0.7 * t, estimates, lost, tuple(names), known, t == CARRIED,
-                      ranges, particles, shares, Hypotheses(weights, means, covariances))  # fmt: skip
+                      ranges, particles, shares, DriveHypotheses(weights, means, covariances))  # fmt: skip
 
 
 SUMMARY = {
@@ -74,7 +74,7 @@ def story(*drives: DriveStory) -> Story:
         plan(), drives or (drive(),), SUMMARY, TILES,
         (("Segments", ("segment", "start", "on the map", "found", "median error"),
           (("1", "0:00", "100 %", "98 %", "0.05 m"), ("2", "1:20", "97 %", "94 %", "0.06 m"))),),
-        (Finding("3 scans of 179 beams dropped, the log's lidar has 180", "warning", "Nothing to do."),
-         Finding("missing transform base_link -> laser: the laser is taken to sit on the base </script>")),
+        (Remark("3 scans of 179 beams dropped, the log's lidar has 180", "warning", "Nothing to do."),
+         Remark("missing transform base_link -> laser: the laser is taken to sit on the base </script>")),
         {"method": "adam_robust", "particles": 500, "seed": 0},
     )  # fmt: skip

@@ -103,7 +103,7 @@ def command(monkeypatch, *words: str) -> None:
 
 def benchmark(suite, methods, runs, particles, seed=0, progress=None):
     """The contents of ``bench.json``."""
-    settings = bench.Settings(runs, particles, seed=seed)
+    settings = bench.BenchSettings(runs, particles, seed=seed)
     return bench.summary(suite, bench.collect(suite, methods, settings, progress), settings)
 
 

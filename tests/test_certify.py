@@ -135,9 +135,9 @@ def test_lidars_that_cannot_be(call, tmp_path, words, message, capsys):
 
 
 def test_lidar_of_three_numbers():
-    lidar = certify.lidar_of(certify.Args(None, None, fov=270.0, range=12.0, beams=361))
+    lidar = certify.lidar_from_args(certify.CertifyArgs(None, None, fov=270.0, range=12.0, beams=361))
     assert lidar.angles()[[0, -1]] == pytest.approx([-0.75 * math.pi, 0.75 * math.pi], abs=1e-5)
-    turn = certify.lidar_of(certify.Args(None, None, fov=360.0, range=12.0, beams=360))
+    turn = certify.lidar_from_args(certify.CertifyArgs(None, None, fov=360.0, range=12.0, beams=360))
     assert turn.angle_increment == pytest.approx(math.radians(1))
 
 

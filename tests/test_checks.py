@@ -33,7 +33,7 @@ def passes(check, *values, names="a", **options) -> bool:
         (checks.finite, [-1e9, 0, 2.5], [NAN, INF, -INF, True, [1]]),
         (checks.share, [0, 0.5, 1], [-1e-9, 1.0001, NAN, True]),
         (checks.count, [1, 2.0, 10**6], [0, -1, 1.5, NAN, INF, True, "3"]),
-        (checks.interval, [(1, 2), (1.0, 1.0), (-3, 5)], [(2, 1), (1,), (1, 2, 3), [1, 2], (1, NAN), (True, 2), 1.0]),
+        (checks.low_high, [(1, 2), (1.0, 1.0), (-3, 5)], [(2, 1), (1,), (1, 2, 3), [1, 2], (1, NAN), (True, 2), 1.0]),
     ],
 )
 def test_edges(check, good, bad):
@@ -51,13 +51,13 @@ def test_shares_with_and_without_their_edges(excluding, zero, one):
 
 def test_least_values():
     assert passes(checks.count, 0, least=0) and not passes(checks.count, 1, least=2)
-    assert passes(checks.interval, (1, 2), least=1) and not passes(checks.interval, (0.9, 2), least=1)
+    assert passes(checks.low_high, (1, 2), least=1) and not passes(checks.low_high, (0.9, 2), least=1)
 
 
 @pytest.mark.parametrize("check", [checks.positive, checks.not_negative, checks.finite, checks.share, checks.count])
 def test_every_field_is_looked_at(check):
     assert passes(check, 1, 1, names="a b") and not passes(check, 1, NAN, names="a b")
-    assert not passes(checks.interval, (1, 2), (2, 1), names="a b")
+    assert not passes(checks.low_high, (1, 2), (2, 1), names="a b")
 
 
 def test_choices_and_sums():

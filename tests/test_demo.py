@@ -68,7 +68,7 @@ def small(monkeypatch):
 
 def test_under_json_nothing_else_is_on_stdout(tmp_path, monkeypatch, capsys):
     """Not even that the page is open, which is told where people look."""
-    scene = demo.Scene(tmp_path / "m.yaml", tmp_path / "log", tmp_path / "truth.tum", (1.0,))
+    scene = demo.DemoFiles(tmp_path / "m.yaml", tmp_path / "log", tmp_path / "truth.tum", (1.0,))
     monkeypatch.setattr(demo, "make", lambda folder, seed: scene)
     monkeypatch.setattr(localize, "answer", lambda words, carried: {"carried": carried})
     opened = []

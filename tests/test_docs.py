@@ -30,9 +30,9 @@ PAGES = [README, *sorted((ROOT / "docs").glob("*.md"))]
 PAPER = (ROOT / "docs" / "paper_to_code.md").read_text()
 LINK = re.compile(r"\[([^\]]*)\]\(([^)#\s]+)\)")
 COMMAND = re.compile(r"python -m dsom_jax\.(\w+) ([^`\n]*)")
-ARGUMENTS = {"bench": "Args", "localize": "Args", "demo": "Args", "certify": "Args", "train": "Arguments",
-             "train_filter": "Arguments", "evaluate": "Args", "export": "Args", "ros2": "Args",
-             "inspect": "Args"}  # fmt: skip
+ARGUMENTS = {"bench": "BenchArgs", "localize": "LocalizeArgs", "demo": "DemoArgs", "certify": "CertifyArgs",
+             "train": "TrainArgs", "train_filter": "TrainFilterArgs", "evaluate": "EvaluateArgs",
+             "export": "ExportArgs", "ros2": "NodeArgs", "inspect": "InspectArgs"}  # fmt: skip
 FOREIGN = {"--clock", "--rate", "--ros-args", "--save", "--system-site-packages"}
 """Options of other programs' commands on the pages: ros2, evo."""
 

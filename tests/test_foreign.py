@@ -110,7 +110,7 @@ def test_localize_holds_all_against_both_references(tmp_path):
         sure, localized = np.full((1, UPDATES), 0.01), np.zeros((1, UPDATES), np.int8)
         info = SimpleNamespace(mean=poses, cluster=poses, lost=sure, p_lost=sure, verdict=localized)
         outcomes.append(Outcome(d, Result(info, None, None), 1.0))
-    args = localize_args.Args(map=tmp_path, log=tmp_path, out=tmp_path)
+    args = localize_args.LocalizeArgs(map=tmp_path, log=tmp_path, out=tmp_path)
     on_plan = carried_over(drives, tmp_path / "plan.tum")
     others = {"amcl": foreign.replies_of(tmp_path / "plan.tum", drives)}
     found = localize.summary_of(outcomes, answered(outcomes, args.method), tiny_world.grid(), args, on_plan, others)

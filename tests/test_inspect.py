@@ -12,10 +12,10 @@ import inspect_kit as kit
 from dsom_jax.data import se2
 from dsom_jax.data.log import select
 from dsom_jax.diagnosis import map_fit
-from dsom_jax.diagnosis.ego_motion import Motion, ego_motion, matched_steps, pieces_of
+from dsom_jax.diagnosis.ego_motion import EgoMotion, ego_motion, matched_steps, pieces_of
 from dsom_jax.diagnosis.explain import MapAnswer, explain, handedness, of_map, of_odometry, scales, yaw
 from dsom_jax.diagnosis.findings import CODES, Finding, ordered
-from dsom_jax.diagnosis.map_fit import Geometry, MapField, Scans
+from dsom_jax.diagnosis.map_fit import Geometry, MapField, Thinned
 from dsom_jax.diagnosis.matching import Reference, bearings, match, points_of, transform
 from dsom_jax.occupancy import from_cells
 
@@ -112,7 +112,7 @@ def test_rays_of_the_field_are_those_of_the_march(field):
 
 
 def test_pieces_of_the_drive_are_found_on_the_map(field, pieces):
-    scans = Scans(LOG.ranges, ANGLES)
+    scans = Thinned(LOG.ranges, ANGLES)
     for piece in pieces:
         found = map_fit.place(field, piece, scans, Geometry())
         off = np.hypot(*(found.poses - kit.path()[piece.scans])[:, :2].T)
@@ -121,7 +121,7 @@ def test_pieces_of_the_drive_are_found_on_the_map(field, pieces):
 
 def test_scale_and_spread_are_refined_together(field, pieces):
     wrong = Geometry(scale=1.04, spread=0.97)
-    seen = Scans(LOG.ranges, ANGLES).under(wrong)
+    seen = Thinned(LOG.ranges, ANGLES).under(wrong)
     numbers = np.concatenate([p.scans for p in pieces])
     found = map_fit.refine(field, seen, numbers, kit.path()[numbers], Geometry())
     # Cells of 10 cm make walls 10 cm thick: 1 % of the ranges.
@@ -129,7 +129,7 @@ def test_scale_and_spread_are_refined_together(field, pieces):
 
 
 def test_a_geometry_undoes_itself():
-    scans = Scans(LOG.ranges[:3], ANGLES)
+    scans = Thinned(LOG.ranges[:3], ANGLES)
     there = scans.under(Geometry(True, 1.25, 1.03))
     back = there.under(Geometry(True, 0.8, 1 / 1.03))
     np.testing.assert_allclose(back.ranges, scans.ranges, rtol=1e-5)
@@ -183,7 +183,7 @@ def test_a_log_of_a_robot_that_sees_nothing_is_not_judged():
     assert (found.code, found.severity) == ("not_judged", "note")
 
 
-MOTION = Motion("as is", 0.95, 0.95, 0.0, 0.0, 1.0, 1.0, 0.0, 0.002, 0.002, 100, 100, 0.0)
+MOTION = EgoMotion("as is", 0.95, 0.95, 0.0, 0.0, 1.0, 1.0, 0.0, 0.002, 0.002, 100, 100, 0.0)
 
 
 def answer(scale: float = 1.0, mirrored: bool = False, held: float = 1.0) -> MapAnswer:

@@ -212,7 +212,7 @@ def test_floor_plans_get_models_of_their_own(call):
     ],
 )
 def test_what_the_summary_says_of_the_filter_is_so(fields, proposal):
-    args = localize_args.Args(Path("m.yaml"), Path("l.log"), Path("out"), particles=8, **fields)
+    args = localize_args.LocalizeArgs(Path("m.yaml"), Path("l.log"), Path("out"), particles=8, **fields)
     filter = localize_args.build(args, tiny_world.grid(), tiny_world.LIDAR)
     assert localize_args.remembers(args) == filter.drawn == (fields == {})
     assert localize_args.drawn_from(args) == proposal and not localize_args.needs_network(args)

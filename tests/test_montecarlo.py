@@ -16,7 +16,7 @@ import pytest
 
 from dsom_jax import montecarlo
 from dsom_jax.episode import Episode
-from dsom_jax.resampling import resample
+from dsom_jax.resampling import draw_ancestors
 from dsom_jax.types import Inputs
 
 
@@ -56,7 +56,7 @@ class Toy:
         weights = jax.nn.softmax(jnp.log(score) + jnp.log1p(prepared[:1] @ jnp.ones((1, self.n))))
         near = jax.lax.top_k(-((poses[:, None] - poses) ** 2).sum(-1), 3)[0].sum(-1)
         weights = weights * jnp.exp(0.01 * near)
-        poses = poses[resample(k_pick, weights, self.n)]
+        poses = poses[draw_ancestors(k_pick, weights, self.n)]
         redrawn = jax.random.categorical(k_new, jnp.log(prepared), shape=(self.n,))
         poses = poses.at[::10, 0].set(redrawn[::10] / 100.0)
         info = Info(jnp.einsum("n,nd->d", weights, poses), jnp.std(poses, axis=0), jnp.cumsum(weights)[-1])

@@ -128,7 +128,7 @@ def test_localize_on_a_drawing_with_a_session(bicocca, monkeypatch, tmp_path):
 
 def test_localize_takes_the_laser_that_is_named(upo, monkeypatch, tmp_path):
     seen: list[Any] = []
-    monkeypatch.setattr(localize, "cut", lambda log, args: seen.append(log) or {}["enough"])
+    monkeypatch.setattr(localize, "segments_of", lambda log, args: seen.append(log) or {}["enough"])
     for laser, shortest in (("/scanfront", 0.0), ("/scanback", 1.0)):
         words = ("--map", upo / "map.yaml", "--log", upo / "made.bag", "--scan-topic", laser, "--odom-topic", "/pose")
         with pytest.raises(KeyError, match="enough"):

@@ -28,7 +28,7 @@ from dsom_jax.judging.run_table import join, run_rows, write_runs
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.occupancy import from_cells
 from dsom_jax.protocol import adapting, clips, command, reporting, running
-from dsom_jax.protocol.plan import Plan, Variant, read_plan, variants
+from dsom_jax.protocol.plan import ProtocolPlan, Variant, read_plan, variants
 
 ROOT = Path(__file__).resolve().parents[1]
 FILES = ("paper_data/upo.yaml", "paper_data/bicocca.yaml", "real/paper.yaml")
@@ -36,7 +36,7 @@ CONFIGS = {name: ROOT / "experiments" / name for name in FILES}
 
 
 def test_every_method_gets_its_proposal_and_the_settings_of_the_map(monkeypatch):
-    plan = Plan(map_kind="drawn", particles=7)
+    plan = ProtocolPlan(map_kind="drawn", particles=7)
     made: list[Any] = []
     monkeypatch.setattr(running, "make_proposal", lambda name, grid, lidar, settings, net, made: (name, net))
     monkeypatch.setattr(running, "with_episode", lambda proposal, episode: (*proposal, episode))
@@ -68,7 +68,7 @@ def test_shipped_configurations_are_the_papers(config):
 
 
 def test_t_cut_is_alg_1s_alone():
-    plan = Plan(methods=("mcl", "adam_dsom@shipped", "adam_dsom", "robust_dsom"), t_cuts=(0.6, 0.5))
+    plan = ProtocolPlan(methods=("mcl", "adam_dsom@shipped", "adam_dsom", "robust_dsom"), t_cuts=(0.6, 0.5))
     assert [v.stem for v in variants(plan)] == [
         "mcl", "adam_dsom-shipped-0.6", "adam_dsom-shipped-0.5", "adam_dsom-0.6", "adam_dsom-0.5", "robust_dsom",
     ]  # fmt: skip
@@ -77,8 +77,9 @@ def test_t_cut_is_alg_1s_alone():
 
 def test_a_map_replaces_what_it_names():
     own = {"learn": {"data": {"removed": 9}}}
-    plan = Plan(maps={"a": {"yaml": "a.yaml", "logs": ["x.log"], "adapt": {"seed": 3}}, "b": {"yaml": "b.yaml", **own}},
-                logs=("all.log",), adapt={"seed": 1, "warmup": 5}, learn={"data": {"short": 0.1}})  # fmt: skip
+    maps = {"a": {"yaml": "a.yaml", "logs": ["x.log"], "adapt": {"seed": 3}}, "b": {"yaml": "b.yaml", **own}}
+    adapt, learn = {"seed": 1, "warmup": 5}, {"data": {"short": 0.1}}
+    plan = ProtocolPlan(maps=maps, logs=("all.log",), adapt=adapt, learn=learn)
     assert plan.on("b")[0].learn == {"data": {"short": 0.1, "removed": 9}} and plan.on("a")[0].learn == plan.learn
     own, fields = plan.on("a")
     assert (own.logs, own.adapt, fields) == (("x.log",), {"seed": 3, "warmup": 5}, {"yaml": "a.yaml"})
@@ -93,7 +94,7 @@ def made_suite(grid, far=1.0) -> Suite:
 
 
 def test_results_are_kept_only_of_the_same_map_logs_and_network(tmp_path):
-    plan, variant, start = Plan(), Variant("adam_dsom", True, 0.6), tmp_path / "net"
+    plan, variant, start = ProtocolPlan(), Variant("adam_dsom", True, 0.6), tmp_path / "net"
     start.mkdir()
     (start / "provenance.json").write_text("{}")
     grid = from_cells(np.eye(8, dtype=bool), ~np.eye(8, dtype=bool), resolution=0.1)
@@ -117,8 +118,8 @@ def test_results_are_kept_only_of_the_same_map_logs_and_network(tmp_path):
 
 def test_mounts_that_differ_by_rounding_are_one_lidar():
     """Two cuts of a log whose poses have six decimals."""
-    a, b = (LidarConfig(4, mount=(x, 0.0, 0.0)) for x in (0.19999992857, 0.19999986657))
-    assert a != b and clips.rounded(a) == clips.rounded(b) != clips.rounded(LidarConfig(4, mount=(0.21, 0.0, 0.0)))
+    a, b, c = (LidarConfig(4, mount=(x, 0.0, 0.0)) for x in (0.19999992857, 0.19999986657, 0.21))
+    assert a != b and clips.rounded_mount(a) == clips.rounded_mount(b) != clips.rounded_mount(c)
 
 
 @pytest.mark.parametrize(
@@ -145,11 +146,11 @@ def test_training_is_called_with_words_that_it_knows(monkeypatch, tmp_path):
     called: list[list[str]] = []
     monkeypatch.setattr(adapting.subprocess, "run", lambda words: called.append(words) or SimpleNamespace(returncode=0))
     start, lidar = ROOT / "checkpoints" / "dsom", LidarConfig(180, -math.pi / 2, math.pi / 180)
-    plan = Plan(adapt_minutes=12.0, adapt={"learning_rate": 1e-4, "scan": {"removed": [0, 9]}})
+    plan = ProtocolPlan(adapt_minutes=12.0, adapt={"learning_rate": 1e-4, "scan": {"removed": [0, 9]}})
     site = adapting.Site(tmp_path / "map.yaml", "a", lidar, tmp_path / "net")
     folder = adapting.adapt(plan, site, start)
     monkeypatch.setattr(sys, "argv", called[0][2:])
-    arguments = parse(train.Arguments, "python -m dsom_jax.train")
+    arguments = parse(train.TrainArgs, "python -m dsom_jax.train")
     assert folder == arguments.out == tmp_path / "net-12-min" and arguments.init == start
     assert arguments.maps == (tmp_path / "map.yaml",) and arguments.minutes == 12.0
     config = train.read_config(arguments.config)
@@ -178,11 +179,11 @@ def test_filters_are_trained_on_with_words_that_their_training_knows(kind, monke
     called: list[list[str]] = []
     monkeypatch.setattr(adapting.subprocess, "run", lambda words: called.append(words) or SimpleNamespace(returncode=0))
     start, lidar = ROOT / "checkpoints" / kind.replace("_", "-"), LidarConfig(361, -math.pi / 2, math.pi / 360)
-    plan = Plan(learn_steps=7, learn={"warmup": 2, "data": {"removed": 9, "drive": {"update_min_d": 0.25}}})
+    plan = ProtocolPlan(learn_steps=7, learn={"warmup": 2, "data": {"removed": 9, "drive": {"update_min_d": 0.25}}})
     site = adapting.Site(tmp_path / "map.yaml", "a", lidar, tmp_path / "net")
     folder = adapting.adapt_filter(plan, site, start, kind)
     monkeypatch.setattr(sys, "argv", called[0][2:])
-    arguments = parse(train_filter.Arguments, "python -m dsom_jax.train_filter")
+    arguments = parse(train_filter.TrainFilterArgs, "python -m dsom_jax.train_filter")
     assert (arguments.filter, arguments.init, arguments.steps, arguments.resume) == (kind, start, 7, True)
     assert folder == arguments.out == tmp_path / f"net-{kind}-7-steps" and arguments.maps == (tmp_path / "map.yaml",)
     config = arguments.read_config(yaml.safe_load(arguments.config.read_text()), "c.yaml")
@@ -219,7 +220,7 @@ def test_only_what_was_made_alike_is_compared(one, other, alike):
 
 @pytest.mark.parametrize("kind", LEARNED)
 def test_results_of_filters_depend_on_their_own_training_alone(kind):
-    plan = Plan(learn_steps=5, learn={"warmup": 1}, adapt={"warmup": 2})
+    plan = ProtocolPlan(learn_steps=5, learn={"warmup": 1}, adapt={"warmup": 2})
     mine, network = (running.trained_on(Variant(name), plan) for name in (kind, "adam_dsom"))
     assert mine == {"learn_steps": 5, "learn": {"warmup": 1}}
     assert network == {"adapt_minutes": 30.0, "adapt_steps": 0, "adapt": {"warmup": 2}}
@@ -237,7 +238,7 @@ def test_each_kind_of_network_is_trained_on_once_in_a_map(monkeypatch, tmp_path)
     monkeypatch.setattr(command, "run_variant", note)
     methods = ("mcl", "adam_dsom@shipped", "adam_dsom", "pf_net", "pf_net@shipped", "pfrnn")
     grid = from_cells(np.zeros((4, 4), bool), np.ones((4, 4), bool), resolution=0.1)
-    start, plan = ROOT / "checkpoints" / "dsom", Plan(methods=methods, t_cuts=(0.6, 0.5), learn_steps=3)
+    start, plan = ROOT / "checkpoints" / "dsom", ProtocolPlan(methods=methods, t_cuts=(0.6, 0.5), learn_steps=3)
     command.run_map(plan, made_suite(grid), tmp_path / "m.yaml", start, "hall", tmp_path / "out", tmp_path / "work")
     shipped = {kind: checkpoint.shipped(kind) for kind in LEARNED}
     assert {stem: folder for stem, (folder, _) in used.items()} == {
@@ -255,7 +256,7 @@ def test_each_kind_of_network_is_trained_on_once_in_a_map(monkeypatch, tmp_path)
 )  # fmt: skip
 def test_what_methods_need_is_asked_for_before_anything_runs(monkeypatch, methods, lost, message):
     monkeypatch.setattr(command.checkpoint, "shipped", lambda kind="dsom": None if kind == lost else Path(kind))
-    plan, args = Plan(methods=methods, t_cuts=(0.6,)), SimpleNamespace(checkpoint=None, config="c.yaml")
+    plan, args = ProtocolPlan(methods=methods, t_cuts=(0.6,)), SimpleNamespace(checkpoint=None, config="c.yaml")
     if message is None:
         assert command.start_network(plan, args) == Path("dsom")
         return
@@ -272,11 +273,11 @@ def test_networks_of_two_kinds_need_not_be_one():
 
 def test_the_report_of_results_is_written_by_clip(tmp_path):
     (tmp_path / "hall").mkdir()
-    plan = Plan(methods=("mcl", "adam_likelihood_grid"), maps={"hall": {}}, t_cuts=(0.6,))
+    plan = ProtocolPlan(methods=("mcl", "adam_likelihood_grid"), maps={"hall": {}}, t_cuts=(0.6,))
     rng = np.random.default_rng(0)
     for variant, off in zip(variants(plan), (1.9, 0.1), strict=True):
         rows, phases = [], {}
-        for phase in reporting.PHASES:
+        for phase in reporting.CLIP_PHASES:
             parts = [measure_errors(off + 0.05 * rng.random((4, 9)), np.zeros((4, 9)), drive=clip) for clip in range(3)]
             rows += [run_rows(variant.method, phase, clip, 0, runs) for clip, runs in enumerate(parts)]
             phases[phase] = summarize(pool(parts))

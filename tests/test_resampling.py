@@ -15,7 +15,7 @@ from dsom_jax import resampling
 from dsom_jax.resampling import pick, pick_in_rows, soft_resample
 
 SCHEMES = ["systematic", "multinomial"]
-resample = jax.jit(resampling.resample, static_argnums=(2, 3))
+resample = jax.jit(resampling.draw_ancestors, static_argnums=(2, 3))
 
 
 def some_weights(seed: int, n: int = 50) -> np.ndarray:
@@ -51,7 +51,7 @@ def test_systematic_has_less_variance_than_multinomial():
     keys = jax.random.split(jax.random.key(0), 300)
     spread = {}
     for method in SCHEMES:
-        ancestors = jax.jit(jax.vmap(lambda k, m=method: resampling.resample(k, weights, 50, m)))(keys)
+        ancestors = jax.jit(jax.vmap(lambda k, m=method: resampling.draw_ancestors(k, weights, 50, m)))(keys)
         counts = np.stack([np.bincount(row, minlength=50) for row in np.asarray(ancestors)])
         spread[method] = counts.var(0).sum()
     assert spread["systematic"] < 0.5 * spread["multinomial"]

@@ -29,7 +29,7 @@ def test_stamps_there_and_back(at):
 
 def test_ranges_become_rep_117():
     scan = messages.scan_of(laser_scan([0.0, 0.05, 2.0, 9.0, np.inf, np.nan, -np.inf, -1.0], -1.0, 0.25))
-    lidar = messages.lidar_of(scan, BASE, 0.1, 8.0)
+    lidar = messages.lidar_of_scan(scan, BASE, 0.1, 8.0)
     expected = [np.nan, -np.inf, 2.0, np.inf, np.inf, np.nan, -np.inf, np.nan]
     np.testing.assert_array_equal(messages.fitted(scan, lidar), np.array(expected, np.float32))
     assert (lidar.range_min, lidar.range_max, lidar.beams) == (0.1, 8.0, 8)
@@ -45,14 +45,14 @@ def test_ranges_become_rep_117():
     ],
 )
 def test_range_limits_are_those_of_nav2(least, most, told, expected):
-    lidar = messages.lidar_of(messages.scan_of(laser_scan([1.0, 2.0], 0.0, 0.1, limit=told)), BASE, least, most)
+    lidar = messages.lidar_of_scan(messages.scan_of(laser_scan([1.0, 2.0], 0.0, 0.1, limit=told)), BASE, least, most)
     assert (lidar.range_min, lidar.range_max) == expected
 
 
 def test_a_scan_in_degrees_is_refused():
     scan = messages.scan_of(laser_scan(np.ones(180), -90.0, 1.0))
     with pytest.raises(UserError, match="radians"):
-        messages.lidar_of(scan, BASE, -1, 25)
+        messages.lidar_of_scan(scan, BASE, -1, 25)
 
 
 def bearing_scan(beams: int, first: float, increment: float) -> messages.Scan:
@@ -73,7 +73,7 @@ def bearing_scan(beams: int, first: float, increment: float) -> messages.Scan:
     ],
 )
 def test_other_beams_are_taken_from_the_nearest(beams, first, increment):
-    lidar = messages.lidar_of(bearing_scan(181, -math.pi / 2, math.pi / 180), BASE, -1, 25)
+    lidar = messages.lidar_of_scan(bearing_scan(181, -math.pi / 2, math.pi / 180), BASE, -1, 25)
     ranges = messages.fitted(bearing_scan(beams, first, increment), lidar)
     wanted = lidar.angle_min + lidar.angle_increment * np.arange(181)
     # The nearest beam is half an increment away at most, and the slope of the ranges is 2.
@@ -81,7 +81,7 @@ def test_other_beams_are_taken_from_the_nearest(beams, first, increment):
 
 
 def test_bearings_that_nobody_measured_are_unknown():
-    lidar = messages.lidar_of(bearing_scan(181, -math.pi / 2, math.pi / 180), BASE, -1, 25)
+    lidar = messages.lidar_of_scan(bearing_scan(181, -math.pi / 2, math.pi / 180), BASE, -1, 25)
     ranges = messages.fitted(bearing_scan(91, -math.pi / 4, math.pi / 180), lidar)
     np.testing.assert_array_equal(np.isfinite(ranges), (np.arange(181) >= 45) & (np.arange(181) <= 135))
     empty = messages.scan_of(laser_scan([], 0.0, 0.0))
@@ -90,7 +90,7 @@ def test_bearings_that_nobody_measured_are_unknown():
 
 def test_same_beams_are_copied():
     scan = bearing_scan(181, -math.pi / 2, math.pi / 180)
-    np.testing.assert_array_equal(messages.fitted(scan, messages.lidar_of(scan, BASE, -1, 25)), scan.ranges)
+    np.testing.assert_array_equal(messages.fitted(scan, messages.lidar_of_scan(scan, BASE, -1, 25)), scan.ranges)
 
 
 def test_a_map_message_has_row_0_at_the_bottom():
@@ -186,7 +186,7 @@ def test_a_laser_head_down():
     np.testing.assert_allclose([mount.x, mount.y, mount.yaw], [0.2, -0.1, 0.7], atol=1e-12)
     # Its beam at bearing b points where the rotation takes it: yaw - b in the base frame.
     scan = messages.scan_of(laser_scan(np.ones(5), -1.0, 0.5))
-    angles = messages.lidar_of(scan, mount, -1, 25).angles()
+    angles = messages.lidar_of_scan(scan, mount, -1, 25).angles()
     q = quaternion(roll=math.pi, yaw=0.7)
     turn = np.array([[1 - 2 * (q.y**2 + q.z**2), 2 * (q.x * q.y - q.z * q.w)],
                      [2 * (q.x * q.y + q.z * q.w), 1 - 2 * (q.x**2 + q.z**2)]])  # fmt: skip

@@ -19,8 +19,8 @@ from dsom_jax import atomic, checkpoint
 from dsom_jax.errors import UserError, run_cli
 from dsom_jax.nn import DSOMConfig, create
 from dsom_jax.run_folder import LOCK, OWNER, Run, check_new, trim_log
-from dsom_jax.run_folder import create as begin
-from dsom_jax.train import Arguments, open_run
+from dsom_jax.run_folder import create_run as begin
+from dsom_jax.train import TrainArgs, open_run
 from dsom_jax.trainer import Parts, train
 from dsom_jax.training.loop import TrainConfig
 
@@ -92,14 +92,14 @@ def test_a_second_training_is_refused_in_one_line_and_a_killed_one_holds_nothing
         assert other.stdout.readline() == "held\n"
         before = everything(out)
         with pytest.raises(UserError, match=rf"another training \(process {other.pid}\) writes there"):
-            open_run(Arguments(out=out, resume=True))
+            open_run(TrainArgs(out=out, resume=True))
         with pytest.raises(UserError, match="add --resume"):
-            open_run(Arguments(out=out))
+            open_run(TrainArgs(out=out))
         with pytest.raises(UserError, match="another training"):
             new(out)  # as if both had found no folder
         assert everything(out) == before
         other.kill()
-    assert open_run(Arguments(out=out, resume=True))[0].total == 9
+    assert open_run(TrainArgs(out=out, resume=True))[0].total == 9
 
 
 def test_a_folder_with_a_checkpoint_and_no_run_is_not_touched(tmp_path):
@@ -109,7 +109,7 @@ def test_a_folder_with_a_checkpoint_and_no_run_is_not_touched(tmp_path):
     before = everything(tmp_path)
     for resume in (True, False):
         with pytest.raises(UserError, match=r"not empty \(provenance.json\) and without run.json"):
-            open_run(Arguments(out=tmp_path, resume=resume))
+            open_run(TrainArgs(out=tmp_path, resume=resume))
     assert everything(tmp_path) == before
 
 
@@ -189,12 +189,12 @@ def test_a_folder_that_another_run_has_taken_is_left_alone(tmp_path):
 def test_a_folder_that_is_removed_while_training_goes_on_is_made_again_with_the_whole_log(tmp_path):
     run = new(tmp_path / "run", 6)
     gone = lambda step: shutil.rmtree(run.out) if step == 4 else None  # noqa: E731
-    train(Arguments(steps=6, save_steps=2), run, lambda: parts(at=gone))
+    train(TrainArgs(steps=6, save_steps=2), run, lambda: parts(at=gone))
     assert [json.loads(line)["step"] for line in (run.out / "metrics.jsonl").read_text().splitlines()] == list(
         range(1, 7)
     )
     assert [path.name for path in run.states()] == ["state-00000004", "state-00000006"]
-    assert open_run(Arguments(out=run.out, resume=True))[0].total == 6
+    assert open_run(TrainArgs(out=run.out, resume=True))[0].total == 6
 
 
 def test_a_full_disk_is_one_line_and_what_was_saved_is_intact(tmp_path, monkeypatch, capsys):
@@ -228,7 +228,7 @@ def test_a_log_that_cannot_be_written_is_one_line(tmp_path, monkeypatch):
 
     monkeypatch.setattr(Path, "open", full)
     with pytest.raises(UserError, match=r"metrics.jsonl: cannot be written \(No space left on device\)"):
-        train(Arguments(steps=2), run, lambda: parts())
+        train(TrainArgs(steps=2), run, lambda: parts())
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -236,7 +236,7 @@ def test_a_signal_ends_training_after_the_step_under_way_and_keeps_it(tmp_path, 
     run = new(tmp_path)
     stop = lambda step: os.kill(os.getpid(), number) if step == 3 else None  # noqa: E731
     with pytest.raises(SystemExit) as end:
-        train(Arguments(steps=9), run, lambda: parts(at=stop))
+        train(TrainArgs(steps=9), run, lambda: parts(at=stop))
     assert end.value.code == 128 + number
     assert [path.name for path in run.states()] == ["state-00000003"] and checkpoint.tag_of(
         tmp_path
@@ -275,7 +275,7 @@ def test_ctrl_c_in_any_command_is_one_line_and_130(capsys):
 def test_a_damaged_run_json_is_one_line_and_nothing_is_written(tmp_path, text, message):
     (tmp_path / "run.json").write_text(text)
     with pytest.raises(UserError, match=message) as raised:
-        open_run(Arguments(out=tmp_path, resume=True))
+        open_run(TrainArgs(out=tmp_path, resume=True))
     assert len(str(raised.value)) < 400 and [p.name for p in tmp_path.iterdir()] == ["run.json"]
 
 

@@ -24,7 +24,7 @@ from dsom_jax.sensor import (
     beam_score,
     distance_field,
     field_log_likelihood,
-    interpolate,
+    interpolate_cells,
     perfect_score,
 )
 from reference import sensor as slow
@@ -189,7 +189,7 @@ def test_likelihood_field_by_hand(yaw):
 def test_bilinear_interpolation():
     field = jnp.array([[0.0, 1.0], [2.0, 5.0]])
     i, j = jnp.array([0.0, 0.5, 1.0, 0.25, -3.0, 9.0]), jnp.array([0.5, 0.5, 0.0, 1.0, 0.0, 9.0])
-    np.testing.assert_allclose(interpolate(field, i, j), [0.5, 2.0, 2.0, 2.0, 0.0, 5.0], atol=1e-6)
+    np.testing.assert_allclose(interpolate_cells(field, i, j), [0.5, 2.0, 2.0, 2.0, 0.0, 5.0], atol=1e-6)
 
 
 def test_an_invalid_scan_says_nothing():

@@ -16,7 +16,7 @@ import pytest
 
 from dsom_jax import checkpoint
 from dsom_jax.errors import UserError
-from dsom_jax.train import Arguments, open_run, read_config
+from dsom_jax.train import TrainArgs, open_run, read_config
 
 CONFIG = """
 model: {width: 2, headings: 4}
@@ -114,14 +114,14 @@ def test_bad_configurations(tmp_path, text, message):
 
 def test_bad_arguments(tmp_path):
     with pytest.raises(UserError, match="--steps 0"):
-        Arguments(steps=0)
+        TrainArgs(steps=0)
     with pytest.raises(UserError, match="--minutes"):
-        Arguments(minutes=0.0)
+        TrainArgs(minutes=0.0)
     (tmp_path / "x").write_text("")
     with pytest.raises(UserError, match="not empty"):
-        open_run(Arguments(out=tmp_path))
+        open_run(TrainArgs(out=tmp_path))
     with pytest.raises(UserError, match="cannot write"):
-        open_run(Arguments(out=tmp_path / "x" / "y"))
+        open_run(TrainArgs(out=tmp_path / "x" / "y"))
     (tmp_path / "run.json").write_text("{}")
     with pytest.raises(UserError, match="no run to resume"):
-        open_run(Arguments(out=tmp_path, resume=True))
+        open_run(TrainArgs(out=tmp_path, resume=True))

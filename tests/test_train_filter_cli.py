@@ -87,7 +87,9 @@ def test_a_run_that_lost_its_end_resumes_bit_for_bit(files, monkeypatch):
 
 def test_a_run_begins_with_the_weights_that_are_named(files, capsys):
     begin = files / "begin"
-    given = train_filter.Arguments("pfrnn", files / "tiny.yaml", (files / "map.yaml",), out=files / "more", resume=True)
+    given = train_filter.TrainFilterArgs(
+        "pfrnn", files / "tiny.yaml", (files / "map.yaml",), out=files / "more", resume=True
+    )
     config = given.read_config(yaml.safe_load((files / "tiny.yaml").read_text()), "tiny.yaml")
     network = create_pfrnn(config.model, 7)
     checkpoint.save(begin, network, {})
@@ -131,14 +133,14 @@ def test_bad_input_is_one_line_and_exit_code_2(files, monkeypatch, capsys, words
 )  # fmt: skip
 def test_bad_configurations(tmp_path, text, message):
     with pytest.raises(UserError, match=message):
-        train_filter.Arguments("pf_net").read_config(yaml.safe_load(text), "c.yaml")
+        train_filter.TrainFilterArgs("pf_net").read_config(yaml.safe_load(text), "c.yaml")
 
 
 def test_scans_that_the_network_would_refuse_are_not_trained_on(files, tmp_path):
     config = yaml.safe_load((files / "tiny.yaml").read_text())
     config["data"]["lidar"] |= {"beams": 16, "angle_min": -1.5}
     (tmp_path / "half.yaml").write_text(yaml.safe_dump(config))
-    given = train_filter.Arguments("pfrnn", tmp_path / "half.yaml", (files / "map.yaml",), out=tmp_path / "never")
+    given = train_filter.TrainFilterArgs("pfrnn", tmp_path / "half.yaml", (files / "map.yaml",), out=tmp_path / "never")
     with pytest.raises(UserError, match=r"half.yaml: data.lidar: field of view 180 deg, trained for 360"):
         train_filter.open_run(given)
     assert not given.folder.exists()
@@ -146,10 +148,10 @@ def test_scans_that_the_network_would_refuse_are_not_trained_on(files, tmp_path)
 
 def test_a_run_of_another_filter_is_not_resumed(tmp_path):
     create = train_filter.FilterRun(tmp_path, training("pfrnn"), (), 3)
-    train_filter.create(create)
+    train_filter.create_run(create)
     with pytest.raises(UserError, match="unknown field"):
-        train_filter.open_run(train_filter.Arguments("pf_net", out=tmp_path, resume=True))
+        train_filter.open_run(train_filter.TrainFilterArgs("pf_net", out=tmp_path, resume=True))
     with pytest.raises(UserError, match="not empty"):
-        train_filter.open_run(train_filter.Arguments("pfrnn", out=tmp_path))
+        train_filter.open_run(train_filter.TrainFilterArgs("pfrnn", out=tmp_path))
     with pytest.raises(UserError, match="--steps 5"):
-        train_filter.open_run(train_filter.Arguments("pfrnn", out=tmp_path, resume=True, steps=5))
+        train_filter.open_run(train_filter.TrainFilterArgs("pfrnn", out=tmp_path, resume=True, steps=5))

@@ -11,8 +11,8 @@ import pytest
 
 from dsom_jax import checkpoint
 from dsom_jax.errors import UserError
-from dsom_jax.run_folder import Run, create
-from dsom_jax.train import Arguments, open_run
+from dsom_jax.run_folder import Run, create_run
+from dsom_jax.train import TrainArgs, open_run
 from dsom_jax.trainer import CALIBRATION_STEPS, Parts, Trainer, train
 from dsom_jax.training.loop import TrainConfig
 
@@ -45,22 +45,22 @@ def run(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(("every", "saved"), [(3, [3, 6]), (4, [4, 6]), (100, [6])])
 def test_the_last_step_is_saved_once(run, every, saved):
-    train(Arguments(steps=6, save_steps=every), run, lambda: parts(0))
+    train(TrainArgs(steps=6, save_steps=every), run, lambda: parts(0))
     assert run.saved == saved
 
 
 def test_a_run_resumed_before_its_length_is_known_gets_all_of_its_minutes(run):
     run.total = None
-    trainer = Trainer(Arguments(minutes=1.0), run, parts(20))
+    trainer = Trainer(TrainArgs(minutes=1.0), run, parts(20))
     trainer.calibrate(20 + 5, 100.0)
     trainer.calibrate(20 + 5 + CALIBRATION_STEPS, 100.0 + CALIBRATION_STEPS)  # one second for each step
     assert run.total == 20 + 5 + CALIBRATION_STEPS + int(60 * 0.95)
 
 
 def test_a_run_resumed_before_its_length_is_known_takes_the_steps_that_are_asked_for(tmp_path):
-    create(Run(tmp_path, TrainConfig(), (), None))
-    assert open_run(Arguments(out=tmp_path, resume=True, steps=7))[0].total == 7
-    assert open_run(Arguments(out=tmp_path, resume=True))[0].total is None
+    create_run(Run(tmp_path, TrainConfig(), (), None))
+    assert open_run(TrainArgs(out=tmp_path, resume=True, steps=7))[0].total == 7
+    assert open_run(TrainArgs(out=tmp_path, resume=True))[0].total is None
 
 
 def test_a_checkpoint_is_not_written_over_in_place(tmp_path, monkeypatch):
@@ -77,11 +77,11 @@ def test_a_checkpoint_is_not_written_over_in_place(tmp_path, monkeypatch):
 
 
 def resume(folder: Path, init: str | None):
-    return open_run(Arguments(out=folder, resume=True, init=None if init is None else folder / init))
+    return open_run(TrainArgs(out=folder, resume=True, init=None if init is None else folder / init))
 
 
 def test_a_resumed_run_begins_with_the_weights_that_it_names(tmp_path, capsys):
-    create(Run(tmp_path, TrainConfig(), (), 6, init="mine"))
+    create_run(Run(tmp_path, TrainConfig(), (), 6, init="mine"))
     with pytest.raises(UserError, match="begins with mine and has saved no state"):
         resume(tmp_path, None)
     with pytest.raises(UserError, match=r"--init .*other: the run in .* began with mine"):
@@ -94,7 +94,7 @@ def test_a_resumed_run_begins_with_the_weights_that_it_names(tmp_path, capsys):
 
 
 def test_a_run_that_began_with_fresh_weights_takes_no_others(tmp_path):
-    create(Run(tmp_path, TrainConfig(), (), 6))
+    create_run(Run(tmp_path, TrainConfig(), (), 6))
     with pytest.raises(UserError, match="began with fresh weights"):
         resume(tmp_path, "mine")
 
@@ -109,6 +109,6 @@ def test_a_checkpoint_that_is_none_has_no_tag(tmp_path):
 def test_batches_follow_the_step_that_was_reached(run):
     asked = []
     made = parts(4)._replace(batches=lambda step, total: asked.append((step, total)))
-    train(Arguments(steps=6), run, lambda: made)
+    train(TrainArgs(steps=6), run, lambda: made)
     assert asked[:2] == [(4, 6), (5, 6)]
     assert [json.loads(line)["step"] for line in (run.out / "metrics.jsonl").read_text().splitlines()] == [5, 6]

@@ -25,7 +25,7 @@ from dsom_jax.training.buildings import (
     mixed_source,
     procedural_source,
     random_poses,
-    turned,
+    turned_square,
 )
 
 ROOM = jnp.zeros((40, 48), bool).at[::39].set(True).at[:, ::47].set(True).at[10:14, 20:24].set(True)
@@ -143,7 +143,7 @@ def test_depth_behind_walls_is_one_number_for_a_scan():
 
 def test_eight_symmetries():
     square = jnp.arange(9).reshape(3, 3)
-    assert len({np.asarray(turned(square, jnp.int32(n))).tobytes() for n in range(8)}) == 8
+    assert len({np.asarray(turned_square(square, jnp.int32(n))).tobytes() for n in range(8)}) == 8
 
 
 @pytest.mark.parametrize(

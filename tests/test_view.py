@@ -14,7 +14,7 @@ from PIL import Image
 
 import made_story
 from dsom_jax.view import Field, Lookalike, Story, render, trajectory_figure
-from dsom_jax.view.page import shown
+from dsom_jax.view.page import readable
 from dsom_jax.view.story import fewer_particles, moments
 
 DATA = re.compile(r'<script type="application/json" id="story">(.*?)</script>', re.S)
@@ -122,7 +122,7 @@ def test_numbers_on_the_page_are_those_of_the_summary(html):
     ],
 )  # fmt: skip
 def test_numbers_as_people_read_them(value, kind, text):
-    assert shown(value, kind).replace("\u00a0", " ") == text
+    assert readable(value, kind).replace("\u00a0", " ") == text
 
 
 def test_text_of_a_log_cannot_break_out(html):

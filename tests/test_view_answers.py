@@ -8,8 +8,8 @@ import numpy as np
 
 from dsom_jax.belief.verdict import Verdict
 from dsom_jax.live.answer import said
-from dsom_jax.view.answers import HEAD, answers, particle_weights, spread, write_answers
-from dsom_jax.view.story import VERDICTS, Hypotheses
+from dsom_jax.view.answers import HEAD, answers, particle_weights, spreads, write_answers
+from dsom_jax.view.story import VERDICTS, DriveHypotheses
 
 SD = np.array([0.2, 0.1, 0.05])
 PLACES = np.array([[2.0, 1.0, 0.5], [9.0, -3.0, -2.0], [5.0, 8.0, np.pi - 0.01]])
@@ -28,16 +28,16 @@ def cloud(seed=0, n=3000):
 
 def test_spread_around_the_answer():
     poses, weights = cloud()
-    sd = spread(PLACES[2:3], poses, weights)
+    sd = spreads(PLACES[2:3], poses, weights)
     assert (np.abs(sd[0] / SD - 1) < 4 / np.sqrt(2 * 300)).all()
     # An answer where no particle is: all of them count.
-    assert (spread(np.array([[50.0, 50.0, 0.0]]), poses, weights)[0, :2] > 40).all()
+    assert (spreads(np.array([[50.0, 50.0, 0.0]]), poses, weights)[0, :2] > 40).all()
 
 
 def places(*weights):
     padded = np.zeros((1, 6))
     padded[0, : len(weights)] = weights
-    return Hypotheses(padded, np.zeros((1, 6, 3)), np.zeros((1, 6, 3, 3)))
+    return DriveHypotheses(padded, np.zeros((1, 6, 3)), np.zeros((1, 6, 3, 3)))
 
 
 def result(verdicts=(Verdict.LOCALIZED,), p_lost=0.02, own=None):
@@ -47,7 +47,7 @@ def result(verdicts=(Verdict.LOCALIZED,), p_lost=0.02, own=None):
     info = SimpleNamespace(
         p_lost=np.full((1, count), p_lost),
         verdict=np.array([verdicts], np.int8),
-        hypotheses=Hypotheses(*(np.repeat(part[None], count, axis=1) for part in own)),
+        hypotheses=DriveHypotheses(*(np.repeat(part[None], count, axis=1) for part in own)),
     )
     kept = SimpleNamespace(poses=np.repeat(poses, count, 0), log_weights=np.log(np.repeat(weights, count, 0)))
     return info, kept

@@ -26,7 +26,7 @@ def made():
 @pytest.fixture(scope="module")
 def html(made):
     suite, _, data, worst = made
-    return benched.render(suite, data, worst)
+    return benched.render_benchmark(suite, data, worst)
 
 
 def looked_up(data, key):

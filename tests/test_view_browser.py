@@ -35,7 +35,7 @@ def chromium():
 @pytest.fixture(scope="module")
 def bench_address(tmp_path_factory):
     path, (suite, _, data, worst) = tmp_path_factory.mktemp("bench") / "report.html", made_bench.made()
-    benched.write_view(path, suite, data, worst)
+    benched.write_benchmark(path, suite, data, worst)
     return path.as_uri()
 
 

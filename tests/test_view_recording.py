@@ -22,7 +22,7 @@ from dsom_jax.data.tf_tree import planar, stamp_of
 from dsom_jax.errors import UserError, run_cli
 from dsom_jax.judging.scores import Drive
 from dsom_jax.lidar import LidarConfig, scan_points
-from dsom_jax.localize_args import Args, check
+from dsom_jax.localize_args import LocalizeArgs, check
 from dsom_jax.occupancy import from_cells
 from dsom_jax.view.recording import MOST, ready, updates, write_mcap
 from dsom_jax.view.rerun_file import returns, write_rerun
@@ -165,7 +165,7 @@ def test_what_cannot_be_written_is_one_line_and_leaves_nothing(tmp_path, write, 
 
 
 def args(**fields):
-    return Args(Path("m.yaml"), Path("l.log"), Path("out"), **fields)
+    return LocalizeArgs(Path("m.yaml"), Path("l.log"), Path("out"), **fields)
 
 
 @pytest.mark.parametrize(

@@ -37,7 +37,7 @@ from dsom_jax.nn import DSOMConfig
 from dsom_jax.occupancy import OccupancyGrid, from_cells
 from dsom_jax.proposals.likelihood_grid import LikelihoodGrid, likelihood_grid
 from dsom_jax.simulate.worlds import WorldConfig, make_world
-from dsom_jax.training.batches import ScanConfig, make_batch, plain
+from dsom_jax.training.batches import ScanConfig, make_batch, plain_scans
 from dsom_jax.training.loop import (
     StageConfig,
     TrainConfig,
@@ -141,7 +141,7 @@ class Record:
         self.facts.setdefault(part, {})[name] = value
         self.facts["seconds"] = round(self.spent(), 1)
         print(f"[{self.spent():5.0f} s] {part} {name}: {json.dumps(value)}", flush=True)
-        checkpoint.write_json(self.path, self.facts)
+        checkpoint.write_record(self.path, self.facts)
 
     def each(self, part: str, calls: dict[str, Callable[[], Any]]) -> None:
         """Results of ``calls`` by name, as many as the part's share allows; one that fails is noted and passed over."""
@@ -230,7 +230,7 @@ def with_batch(config: TrainConfig, worlds: int, scans: int) -> TrainConfig:
 
 def held_out(config: TrainConfig, stage: StageConfig) -> Callable[[Any], dict[str, float]]:
     """Evaluation on buildings that training does not see."""
-    scans = plain(config.scan)
+    scans = plain_scans(config.scan)
     source = world_source(replace(config, scan=scans), stage)
     make = jax.jit(lambda key: make_batch(key, source, scans, stage.worlds, stage.scans, config.model))
     return make_evaluation(make(jax.random.key(2**31 - 1 - config.seed)), scans.lidar)
@@ -296,7 +296,7 @@ class Training:
         data = {"data": "procedural buildings, dsom_jax.simulate.make_world", "train": asdict(self.config)}
         folder = self.record.path.with_name("dsom-paper")
         checkpoint.save(folder, model, facts | data, tag=f"weights-{self.done:08d}", half=True)
-        checkpoint.write_json(folder.parent / "curve.json", self.curve)
+        checkpoint.write_record(folder.parent / "curve.json", self.curve)
         self.record.note("network", f"{phase}, step {self.done}", {"samples": samples, **scores})
 
 

@@ -22,11 +22,11 @@ from dsom_jax.cli import parse
 from dsom_jax.errors import UserError, run_cli
 from dsom_jax.nn import DSOM, create
 from dsom_jax.nn.dsom import MapFeatures
-from dsom_jax.train import Arguments, Material, open_run, parts
+from dsom_jax.train import Material, TrainArgs, open_run, parts
 from dsom_jax.trainer import train
 from dsom_jax.training.batches import Batch
 from dsom_jax.training.loop import TrainConfig, make_step, split_model
-from dsom_jax.training.loss import PLACES, similarity_loss
+from dsom_jax.training.loss import PLACE_AXES, similarity_loss
 from dsom_jax.training.memory import keep_freed_memory
 from dsom_jax.training.target import make_target
 from dsom_jax.types import Array
@@ -36,7 +36,7 @@ LIKENESS = 10.0
 
 
 @dataclass(frozen=True)
-class Args(Arguments):
+class Args(TrainArgs):
     """Train the encoders of a network after those of another."""
 
     teacher: Path = checkpoint.SHIPPED
@@ -79,15 +79,15 @@ def coarse(model: DSOM, batch: Batch, config: TrainConfig) -> Array:
 
 def standard(x: Array) -> Array:
     """Each SIM of x (N, S, h, w, K) with mean zero and length one."""
-    x = x - x.mean(PLACES, keepdims=True)
-    return x * jax.lax.rsqrt((x * x).sum(PLACES, keepdims=True) + 1e-6)
+    x = x - x.mean(PLACE_AXES, keepdims=True)
+    return x * jax.lax.rsqrt((x * x).sum(PLACE_AXES, keepdims=True) + 1e-6)
 
 
 def imitation(similarity: Array, given: Array) -> tuple[Array, Array]:
     """How far SIM is from the teacher's (N, S, h, w, K): mean correlation, and cross-entropy of the softmaxes."""
-    truth = jax.nn.softmax(given, axis=PLACES)
-    entropy = -(truth * jax.nn.log_softmax(similarity, axis=PLACES)).sum(PLACES)
-    return (standard(similarity) * standard(given)).sum(PLACES).mean(), entropy.mean()
+    truth = jax.nn.softmax(given, axis=PLACE_AXES)
+    entropy = -(truth * jax.nn.log_softmax(similarity, axis=PLACE_AXES)).sum(PLACE_AXES)
+    return (standard(similarity) * standard(given)).sum(PLACE_AXES).mean(), entropy.mean()
 
 
 class Imitation(NamedTuple):

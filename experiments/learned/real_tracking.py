@@ -23,14 +23,14 @@ from dsom_jax.data.cut import to_episode
 from dsom_jax.errors import UserError, run_cli
 from dsom_jax.filters.methods import LEARNED
 from dsom_jax.protocol.clips import windows
-from dsom_jax.protocol.plan import Plan, map_file, read_logs, read_plan
+from dsom_jax.protocol.plan import ProtocolPlan, map_file, read_logs, read_plan
 from dsom_jax.run_folder import commit
 
 ROOT = HERE.parents[1]
 DATA = Path(os.environ.get("DSOM_DATA") or ROOT.parent / "shared" / "data")
 
 
-def pieces(plan: Plan, name: str, data: Path, work: Path, count: int) -> tuple[Any, Any, list[Any]]:
+def pieces(plan: ProtocolPlan, name: str, data: Path, work: Path, count: int) -> tuple[Any, Any, list[Any]]:
     """Map, lidar, and ``count`` pieces of its logs, evenly spread."""
     one, fields = plan.on(name)
     grid = load_map(map_file(name, fields, data, work))

@@ -19,7 +19,7 @@ HERE_RESULTS, RUNS = HERE / "results", HERE.parents[1] / "runs"
 
 
 @dataclass(frozen=True)
-class Args(command.Args):
+class Args(command.ProtocolArgs):
     """Run one configuration."""
 
     out: Path = HERE_RESULTS

@@ -48,9 +48,9 @@ class Args:
     """Network; default: the one in the repository."""
 
 
-def scans(args: localize_args.Args, log: RawLog) -> tuple[Array, Array]:
+def scans(args: localize_args.LocalizeArgs, log: RawLog) -> tuple[Array, Array]:
     """Ranges (N, B) and reference poses (N, 3)."""
-    drives = localize.cut(log, args)
+    drives = localize.segments_of(log, args)
     ranges, poses = (jnp.concatenate([getattr(d.episode, key) for d in drives])[::EVERY] for key in ("ranges", "poses"))
     known = np.isfinite(poses).all(-1)
     return ranges[known], poses[known]
@@ -68,7 +68,9 @@ def proposals(name: str, grid: OccupancyGrid, log: RawLog, folder: Path) -> Iter
 def judge(name: str, args: Args, folder: Path) -> dict[str, dict[str, float]]:
     """Quality of every proposal on one log, printed as it comes."""
     place, kept = LOGS[name]
-    options = localize_args.Args(map=args.data / place / "map.yaml", log=args.data / kept / "log.clf.gz", out=args.out)
+    options = localize_args.LocalizeArgs(
+        map=args.data / place / "map.yaml", log=args.data / kept / "log.clf.gz", out=args.out
+    )
     grid, log = load_ros_map(options.map), limited(load_log(options.log), options.laser_max_range)
     ranges, poses = scans(options, log)
     found = {}

@@ -22,7 +22,7 @@ ROOT = HERE.parents[1]
 
 
 @dataclass(frozen=True)
-class Args(command.Args):
+class Args(command.ProtocolArgs):
     """Run the series and write the report."""
 
     config: Path = HERE / "paper.yaml"

@@ -73,11 +73,13 @@ def judged(case: strangers.Case, truth: Path, folder: Path, args: Args) -> dict:
     path = folder / "made" if (folder / "made").is_dir() else case.write(folder)
     grid = load_map(folder.parents[1] / "map" / "made")
     log = load_log(path, case.options, reference=None if case.own_reference else truth)
-    settings = localize_args.Args(path, path, folder, runs=args.runs, segments=args.segments, particles=args.particles)
+    settings = localize_args.LocalizeArgs(
+        path, path, folder, runs=args.runs, segments=args.segments, particles=args.particles
+    )
     settings = replace(settings, steps_per_segment=args.steps)
     log = limited(log, settings.laser_max_range)
     filter = localize_args.build(settings, grid, log.lidar)
-    outcomes = localize.localize(filter, localize.cut(log, settings), args.runs, settings.seed)
+    outcomes = localize.localize(filter, localize.segments_of(log, settings), args.runs, settings.seed)
     given = answered(outcomes, settings.method)
     summary = json.loads(json.dumps(localize.summary_of(outcomes, given, grid, settings)))
     return {rate: summary[rate] for rate in (*RATES, "e_pos_m_median")} | {

@@ -32,7 +32,7 @@ from dsom_jax import checkpoint
 from dsom_jax.errors import run_cli
 from dsom_jax.nn import DSOMConfig, create
 from dsom_jax.run_folder import Run, commit
-from dsom_jax.train import Arguments, open_run
+from dsom_jax.train import TrainArgs, open_run
 from dsom_jax.trainer import Parts, train
 
 RESULTS = Path(__file__).parent / "results"
@@ -69,7 +69,7 @@ def work(out: Path, steps: int, pause: float, saved: int) -> None:
         os.write(saved, b"%d\n" % int(state.step))
 
     Run.save = save  # type: ignore[method-assign,assignment]
-    args = Arguments(out=out, resume=True, steps=steps, save_steps=2)
+    args = TrainArgs(out=out, resume=True, steps=steps, save_steps=2)
     run, _ = open_run(args)
 
     def forward(now: State, batch: Any, total: Any) -> tuple[State, dict[str, float]]:

@@ -49,7 +49,7 @@ def jobs(config: Config) -> dict[str, Any]:
 
 def compare(name: str, config: Config, lab: Lab) -> dict[str, Any]:
     """One method on all sequences: its entry of ``bench.json``, every run, and E_pos over time."""
-    settings = bench.Settings(config.runs, config.particles, config.t_cut, lab.seed, config.weight_power)
+    settings = bench.BenchSettings(config.runs, config.particles, config.t_cut, lab.seed, config.weight_power)
     entry, record = lab.compare(name, settings)
     bands = plotting.bands_of(record.traces)
     return {"summary": entry, "runs": record.table, "evolution": bands, "kidnapped": kidnappings(lab)}

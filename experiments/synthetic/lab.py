@@ -137,7 +137,7 @@ class Lab:
         """
         return [work(number, *parts) for number, parts in enumerate(self.suite.episodes)]
 
-    def compare(self, name: str, settings: bench.Settings) -> tuple[dict[str, Any], bench.Record]:
+    def compare(self, name: str, settings: bench.BenchSettings) -> tuple[dict[str, Any], bench.Record]:
         """A method on all sequences: its entry of ``bench.json``, and all of its runs."""
         chosen = {"particles": settings.particles, "t_cut": settings.t_cut, "weight_power": settings.weight_power}
         build: bench.Build = partial(self.build, **chosen)  # type: ignore[arg-type]

@@ -16,7 +16,7 @@ from tables import markdown, percent
 
 from dsom_jax.episode import Episode
 from dsom_jax.judging import metrics
-from dsom_jax.judging.scores import judge, judged_by, replies
+from dsom_jax.judging.scores import judge_drive, judged_by, replies
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.plotting.charts import STYLES
 from dsom_jax.plotting.common import legend
@@ -61,7 +61,7 @@ def follow(
     """The runs of one method on one sequence: by factor, then by phase."""
     filter, keys = lab.build(name, where, grid, episode, config.particles), lab.keys(config.runs)[number]
     results = run_all(filter, noisier, config.factors, with_error(episode), keys)
-    return [judge(replies(result.info, judged_by(name)), episode, number) for result in results]
+    return [judge_drive(replies(result.info, judged_by(name)), episode, number) for result in results]
 
 
 def summary(parts: list[list[metrics.Runs]]) -> dict[str, Any]:

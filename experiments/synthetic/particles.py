@@ -34,7 +34,7 @@ def jobs(config: Config) -> dict[str, Any]:
 
 def vary(count: int, config: Config, lab: Lab) -> dict[str, Any]:
     """AdaM + DSOM with ``count`` particles on all sequences."""
-    entry, record = lab.compare(METHOD, bench.Settings(config.runs, count, config.t_cut, lab.seed))
+    entry, record = lab.compare(METHOD, bench.BenchSettings(config.runs, count, config.t_cut, lab.seed))
     return {"summary": entry, "runs": record.table}
 
 

@@ -34,7 +34,7 @@ def jobs(config: Config) -> dict[str, Any]:
 
 def run(name: str, config: Config, lab: Lab) -> dict[str, Any]:
     """One method on all sequences."""
-    settings = bench.Settings(config.runs, config.particles, config.t_cut, lab.seed, config.weight_power)
+    settings = bench.BenchSettings(config.runs, config.particles, config.t_cut, lab.seed, config.weight_power)
     entry, record = lab.compare(name, settings)
     return {"summary": entry, "runs": record.table}
 

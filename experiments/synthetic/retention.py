@@ -20,7 +20,7 @@ from dsom_jax.episode import Episode
 from dsom_jax.filters.methods import COMBINATIONS
 from dsom_jax.judging import metrics, quality
 from dsom_jax.judging.run_table import RunTable, join, run_rows
-from dsom_jax.judging.scores import judge, judged_by, replies
+from dsom_jax.judging.scores import judge_drive, judged_by, replies
 from dsom_jax.montecarlo import run
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.plotting.common import legend, log_ticks
@@ -91,7 +91,7 @@ def told(parts: list[Part], t_cut: float | None) -> dict[str, Any]:
     pooled: dict[str, list[metrics.Runs]] = {"global": [], "kidnap": []}
     for part in parts:
         given = replies(part.result.info, judged_by(part.method))
-        for phase, runs in judge(given, part.episode, part.number).items():
+        for phase, runs in judge_drive(given, part.episode, part.number).items():
             pooled[phase] += runs
             found += [run_rows(part.method, phase, part.number, n, some) for n, some in enumerate(runs)]
     summaries = {phase: metrics.summarize(metrics.pool(runs)) for phase, runs in pooled.items()}

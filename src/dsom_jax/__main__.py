@@ -13,14 +13,14 @@ _PACKAGES = ("ros2",)
 """Commands that are folders."""
 
 
-def start(name: str) -> None:
+def _start(name: str) -> None:
     """Run the command ``name`` with the words of the command line; what it needs is imported here."""
     module = f"dsom_jax.{name}.__main__" if name in _PACKAGES else f"dsom_jax.{name}"
     run_cli(lambda: import_module(module).main())
 
 
 demo, inspect, localize, ros2, certify, bench, export, evaluate, train, train_filter = (
-    partial(start, name) for name in COMMANDS
+    partial(_start, name) for name in COMMANDS
 )
 
 
@@ -33,7 +33,7 @@ def main() -> None:
     name = sys.argv.pop(1)
     if name.replace("-", "_") not in COMMANDS:
         raise UserError(f"{name}: no such command; there are {names}")
-    start(name.replace("-", "_"))
+    _start(name.replace("-", "_"))
 
 
 if __name__ == "__main__":

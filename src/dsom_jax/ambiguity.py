@@ -23,7 +23,7 @@ from dsom_jax.proposals.likelihood_grid import LikelihoodGridConfig, likelihood_
 from dsom_jax.proposals.markov_grid import MarkovGrid
 from dsom_jax.raycast import RaycastConfig, cast_rays, make_tables
 from dsom_jax.sensor import BeamModel
-from dsom_jax.simulate.drive import DriveConfig, measure
+from dsom_jax.simulate.drive import DriveConfig, measure_odometry
 from dsom_jax.simulate.paths import drive, roads
 from dsom_jax.types import Array, Inputs
 
@@ -90,8 +90,8 @@ def try_out(
     batches: Callable[[Sequence[int]], Iterable[int]] = iter,
 ) -> Tried:
     """Drive about and see what the belief makes of it; ``batches`` may show how far it has come."""
-    poses = plan(grid, config, seed)
-    belief = build(grid, lidar, config)
+    poses = _plan(grid, config, seed)
+    belief = _build(grid, lidar, config)
     tables = make_tables(grid, RaycastConfig("exact"), lidar.range_max)
     parts = []
     for start in batches(range(0, config.drives, config.batch)):
@@ -106,7 +106,7 @@ def try_out(
     return Tried(poses, metres, truth, other, other_pose)
 
 
-def build(grid: OccupancyGrid, lidar: LidarConfig, config: AmbiguityConfig) -> MarkovGrid:
+def _build(grid: OccupancyGrid, lidar: LidarConfig, config: AmbiguityConfig) -> MarkovGrid:
     """The belief, on cells as fine as ``states`` allows."""
     resolution = max(0.2, grid.resolution)
     while resolution < 1 and int(resample_free(grid, resolution).free.sum()) * config.headings > config.states:
@@ -116,7 +116,7 @@ def build(grid: OccupancyGrid, lidar: LidarConfig, config: AmbiguityConfig) -> M
     return MarkovGrid(likelihood_grid(grid, lidar, settings))
 
 
-def plan(grid: OccupancyGrid, config: AmbiguityConfig, seed: int) -> np.ndarray:
+def _plan(grid: OccupancyGrid, config: AmbiguityConfig, seed: int) -> np.ndarray:
     """(D, T, 3) drives from places that are spread over the building, in the map frame."""
     network, rng = roads(grid), np.random.default_rng(seed)
     if len(network.cells) < 2:
@@ -143,7 +143,7 @@ def _follow(
         k_scan, k_odometry = jax.random.split(key)
         ranges = observe(k_scan, cast_rays(tables, path, lidar), lidar, noise)
         before = jnp.concatenate([path[:1], path[:-1]])
-        odometry = measure(k_odometry, before, path, DriveConfig().odometry)
+        odometry = measure_odometry(k_odometry, before, path, DriveConfig().odometry)
 
         def update(memory: Array, now: tuple[Inputs, Array]) -> tuple[Array, tuple[Array, Array, Array]]:
             told, pose = now

@@ -22,13 +22,13 @@ from dsom_jax.judging import metrics
 from dsom_jax.judging.by_drive import Judged, Worst, by_drive, judge_drives, worst_run
 from dsom_jax.judging.foreign import drives_of, named, replies_of_suite
 from dsom_jax.judging.run_table import RunTable, join, run_rows, write_runs
-from dsom_jax.judging.scores import judge, judged_by, replies
+from dsom_jax.judging.scores import judge_drive, judged_by, replies
 from dsom_jax.montecarlo import Result, run, run_keys, signature
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.protocol.digests import digests
 from dsom_jax.trained import by_kind, check_networks, check_used, find_networks, load_networks
 from dsom_jax.types import Filter, Key, Proposal
-from dsom_jax.view.benched import write_view
+from dsom_jax.view.benched import write_benchmark
 
 ESTIMATES = ("mean", "cluster")
 """The weighted mean of the paper, and the mean of the heaviest cluster."""
@@ -37,7 +37,7 @@ PER_EPISODE = ("mixture_mcl_star", "mixture_mcl_sharp_star")
 
 
 @dataclass(frozen=True)
-class Args:
+class BenchArgs:
     """Compare localization methods on a suite of drives, each with one kidnapping."""
 
     runs: int = 100
@@ -70,8 +70,8 @@ class Args:
 
 
 @dataclass(frozen=True)
-class Settings:
-    """What all methods have in common; see :class:`Args`."""
+class BenchSettings:
+    """What all methods have in common; see :class:`BenchArgs`."""
 
     runs: int = 100
     particles: int = 200
@@ -118,7 +118,11 @@ Build = Callable[[str, str, OccupancyGrid, Episode], Filter]
 
 
 def collect(
-    suite: Suite, methods: Sequence[str], settings: Settings, progress: Advance | None = None, checkpoint: Any = None
+    suite: Suite,
+    methods: Sequence[str],
+    settings: BenchSettings,
+    progress: Advance | None = None,
+    checkpoint: Any = None,
 ) -> dict[str, Record]:
     """Run every method on every sequence; run r of a sequence has the same key for all methods.
 
@@ -176,7 +180,7 @@ def run_method(name: str, suite: Suite, keys: Sequence[Key], build: Build, progr
         filter = filters[known] = filters.get(known) or build(name, where, grid, episode)
         result = clock.run(filter, episode, keys[number])
         for estimate, by_phase in parts.items():
-            for phase, runs in judge(replies(result.info, estimate), episode, number).items():
+            for phase, runs in judge_drive(replies(result.info, estimate), episode, number).items():
                 by_phase[phase] += runs
                 if estimate == judged_by(name):
                     rows += [run_rows(name, phase, number, part, some) for part, some in enumerate(runs)]
@@ -200,7 +204,7 @@ class Clock:
     def run(self, filter: Filter, episode: Episode, keys: Key) -> Result:
         """As :func:`montecarlo.run`, finished on return."""
         start = time.perf_counter()
-        result = jax.block_until_ready(run(filter, episode, keys, moments(episode)))
+        result = jax.block_until_ready(run(filter, episode, keys, picture_updates(episode)))
         elapsed = (time.perf_counter() - start) / episode.ranges.shape[0]
         shape = (signature(filter, episode), keys.shape)
         if shape in self.compiled:
@@ -216,7 +220,7 @@ class Clock:
         return 1e3 * float(np.median(self.seconds))
 
 
-def moments(episode: Episode) -> tuple[int, ...]:
+def picture_updates(episode: Episode) -> tuple[int, ...]:
     """Four updates worth a picture: the start, soon after, the first kidnapping (or half way), soon after."""
     moved = np.flatnonzero(np.asarray(episode.kidnapped)[1:]) + 1
     last = len(episode.ranges) - 1
@@ -224,7 +228,7 @@ def moments(episode: Episode) -> tuple[int, ...]:
     return 0, min(5, last), middle, min(middle + 5, last)
 
 
-def summary(suite: Suite, records: dict[str, Record], settings: Settings) -> dict[str, Any]:
+def summary(suite: Suite, records: dict[str, Record], settings: BenchSettings) -> dict[str, Any]:
     """``bench.json``: see :mod:`dsom_jax.report`."""
     methods = {}
     for name, record in records.items():
@@ -253,7 +257,7 @@ def write_results(
     """Write bench.json, bench.md, report.html and the figures."""
     report.write_json(folder / "bench.json", data)
     report.write_text(folder / "bench.md", report.markdown(data))
-    write_view(folder / "report.html", suite, data, {name: found.worst for name, found in judged.items()})
+    write_benchmark(folder / "report.html", suite, data, {name: found.worst for name, found in judged.items()})
     runs = {name: record.runs[judged_by(name)] for name, record in records.items()}
     traces = [{name: record.traces[n] for name, record in records.items()} for n in range(len(suite.episodes))]
     moved = [np.asarray(episode.kidnapped) for _, _, episode in suite.episodes]
@@ -262,7 +266,7 @@ def write_results(
     for name, record in records.items():
         estimates = getattr(record.result.info, judged_by(name))[0]
         figures[f"map_{name}"] = plotting.moment_figure(
-            grid, suite.lidar, episode, record.filter, moments(episode), record.result.kept.poses, estimates
+            grid, suite.lidar, episode, record.filter, picture_updates(episode), record.result.kept.poses, estimates
         )
     for name, figure in figures.items():
         plotting.save_figure(figure, folder / f"{name}.png")
@@ -270,10 +274,10 @@ def write_results(
 
 def main() -> None:
     """Argument handling."""
-    args = parse(Args, "python -m dsom_jax.bench")
+    args = parse(BenchArgs, "python -m dsom_jax.bench")
     if args.per_run and not args.out:
         raise UserError("--per-run: give --out, the folder for runs.npz")
-    settings = Settings(args.runs, args.particles, args.t_cut, args.seed, args.weight_power)
+    settings = BenchSettings(args.runs, args.particles, args.t_cut, args.seed, args.weight_power)
     asked = {"dsom": args.checkpoint, "pf_net": args.pf_net, "pfrnn": args.pfrnn}
     folders = find_networks(asked)
     methods = chosen_methods(args.methods, folders)

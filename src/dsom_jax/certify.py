@@ -27,7 +27,7 @@ DISTANCES = (0, 2, 5, 10)
 
 
 @dataclass(frozen=True)
-class Args:
+class CertifyArgs:
     """Try a building before a robot is in it: how far must it drive until it is found, and which places look alike?"""
 
     map: Path
@@ -52,8 +52,8 @@ class Args:
 
 def main() -> None:
     """Command line."""
-    args = parse(Args, "python -m dsom_jax.certify")
-    lidar = lidar_of(args)
+    args = parse(CertifyArgs, "python -m dsom_jax.certify")
+    lidar = lidar_from_args(args)
     grid = load_map(args.map)
     folder = report.output_folder(args.out)
     config = AmbiguityConfig(drives=args.drives)
@@ -72,7 +72,7 @@ def main() -> None:
         print_result(result, folder)
 
 
-def lidar_of(args: Args) -> LidarConfig:
+def lidar_from_args(args: CertifyArgs) -> LidarConfig:
     """The lidar that the arguments describe; UserError for one that cannot be."""
     for name, most in (("fov", 360.0), ("range", 1000.0), ("beams", 100_000), ("drives", 100_000)):
         if not 0 < getattr(args, name) <= most:

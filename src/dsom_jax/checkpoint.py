@@ -29,7 +29,7 @@ from dsom_jax.lidar import LidarConfig
 from dsom_jax.nn import KINDS, evaluation_view, kind_of
 from dsom_jax.training.options import override
 
-T = TypeVar("T")
+_T = TypeVar("_T")
 PROVENANCE = "provenance.json"
 DRAFT = ".orbax-checkpoint-tmp"
 """What orbax adds to the name of a folder until it is complete."""
@@ -82,7 +82,7 @@ def write(
     except OSError as error:
         raise UserError(f"{directory}: cannot write the checkpoint ({error.strerror}); give another folder") from error
     _save_tree(directory / tag, _halved(_weights(model)) if half else _weights(model))
-    write_json(directory / PROVENANCE, {**record, **(provenance or {})})
+    write_record(directory / PROVENANCE, {**record, **(provenance or {})})
     return tag
 
 
@@ -112,7 +112,7 @@ def load_provenance(directory: str | Path, kind: str = "dsom") -> dict[str, Any]
     path = Path(directory) / PROVENANCE
     if not path.is_file():
         raise UserError(f"{path}: no such file; give a folder written by `python -m {KINDS[kind].command} --out`")
-    record = read_json(path, "restore the file or train again")
+    record = read_record(path, "restore the file or train again")
     if not isinstance(record, dict) or record.get("format") != FORMAT:
         raise UserError(f"{path}: field format is not {FORMAT}; this is not a checkpoint of this version, train again")
     for name in ("model", "weights"):
@@ -136,7 +136,7 @@ def tag_of(directory: str | Path) -> str | None:
     """Name of the folder of the weights that the checkpoint in ``directory`` consists of; None without a checkpoint."""
     path = Path(directory) / PROVENANCE
     try:
-        tag = read_json(path, "")["weights"] if path.is_file() else None
+        tag = read_record(path, "")["weights"] if path.is_file() else None
     except (UserError, KeyError, TypeError, IndexError):
         return None
     # Weights lie in the folder itself: a name that leads elsewhere is none.
@@ -148,17 +148,17 @@ def save_state(directory: str | Path, state: Any) -> None:
     _save_tree(Path(directory).absolute(), state)
 
 
-def load_state(directory: str | Path, like: T) -> T:
+def load_state(directory: str | Path, like: _T) -> _T:
     """Read a pytree that has the structure, shapes and dtypes of ``like``."""
     return _load_tree(Path(directory).absolute(), like)
 
 
-def write_json(path: Path, record: Any) -> None:
+def write_record(path: Path, record: Any) -> None:
     """Write JSON so that ``path`` holds the old or the new text, never a part."""
     write_atomic(path, (json.dumps(record, indent=2) + "\n").encode())
 
 
-def read_json(path: Path, advice: str) -> Any:
+def read_record(path: Path, advice: str) -> Any:
     """The record in a JSON file; UserError, ending in ``advice``, for one that cannot be read or is none."""
     try:
         if path.stat().st_size > JSON_BYTES:
@@ -220,7 +220,7 @@ def _quiet() -> Iterator[None]:
         chatter.setLevel(level)
 
 
-def _load_tree(path: Path, like: T) -> T:
+def _load_tree(path: Path, like: _T) -> _T:
     if not path.is_dir():
         raise UserError(f"{path}: the folder of the weights is missing; copy the whole checkpoint or train again")
     abstract = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), like)

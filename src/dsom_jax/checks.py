@@ -57,10 +57,10 @@ def count(config: Any, names: str, least: int = 1) -> None:
     for name in names.split():
         value = getattr(config, name)
         if not hasattr(value, "aval") and not (_number(value) and value >= least and value == int(value)):
-            raise ValueError(message(config, name, f"give at least {NAMES.get(least, least)}, a whole number"))
+            raise ValueError(message(config, name, f"give at least {_NAMES.get(least, least)}, a whole number"))
 
 
-NAMES = {1: "one"}
+_NAMES = {1: "one"}
 
 
 def choice(config: Any, name: str, allowed: Sequence[str]) -> None:
@@ -69,7 +69,7 @@ def choice(config: Any, name: str, allowed: Sequence[str]) -> None:
         raise ValueError(message(config, name, f"choose {' or '.join(map(repr, allowed))}"))
 
 
-def interval(config: Any, names: str, least: float = -math.inf) -> None:
+def low_high(config: Any, names: str, least: float = -math.inf) -> None:
     """ValueError unless the fields are pairs (low, high) of finite numbers with least <= low <= high."""
     for name in names.split():
         pair = getattr(config, name)

@@ -23,14 +23,14 @@ from dsom_jax import report
 from dsom_jax.cache import keep_compiled
 from dsom_jax.errors import UserError
 
-T = TypeVar("T")
+_T = TypeVar("_T")
 Advance = Callable[[str, int], None]
 """Called with a method and the number of a sequence before each drive."""
 _FRAME = re.compile(r"\x1b\[[0-9;]*m|[│╭╮╰╯]|^\s*[|+]|[|+]\s*$")
 """Frames of boxes; terminals that know ASCII only get them from | + and -."""
 
 
-def parse(arguments: type[T], prog: str, words: Sequence[str] | None = None) -> T:
+def parse(arguments: type[_T], prog: str, words: Sequence[str] | None = None) -> _T:
     """The dataclass ``arguments`` from ``words``, those of the command line; UserError for words that do not fit it.
 
     ``prog`` is what the user typed before them, such as ``python -m dsom_jax.bench``. What is compiled from here on is
@@ -44,10 +44,10 @@ def parse(arguments: type[T], prog: str, words: Sequence[str] | None = None) -> 
     except SystemExit as stop:
         if stop.code != 2:
             raise
-    raise UserError(f"{one_line(box.getvalue())}; see {prog} --help")
+    raise UserError(f"{_one_line(box.getvalue())}; see {prog} --help")
 
 
-def one_line(box: str) -> str:
+def _one_line(box: str) -> str:
     """The message in the box that tyro draws: its first section, and the second if that offers a correction."""
     rows = [_FRAME.sub("", row).strip() for row in box.splitlines()[1:]]
     sections = [part for part in re.split(r"[─-]{3,}", " ".join(row for row in rows if row)) if part.strip()] or [""]
@@ -64,7 +64,7 @@ def stage(says: str) -> Iterator[None]:
         yield
 
 
-def each(items: Sequence[T], says: str) -> Iterable[T]:
+def each(items: Sequence[_T], says: str) -> Iterable[_T]:
     """``items`` one after another, with a bar on stderr; the first includes the compilation, and is not reckoned with
     in the time that is left."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),

@@ -23,7 +23,7 @@ from dsom_jax.simulate.drive import DriveConfig, make_synthetic
 from dsom_jax.simulate.worlds import WorldConfig, make_world
 from dsom_jax.summary_table import print_summary
 
-START = 1_700_000_000.0
+_START = 1_700_000_000.0
 """Stamp of the first scan: a clock as robots have it."""
 BUILDING = WorldConfig(cells=160, resolution=0.2, rotated=0.0, furniture=0.5)
 LIDAR = LidarConfig(beams=180, angle_min=-0.75 * np.pi, angle_increment=1.5 * np.pi / 179, range_min=0.1,
@@ -33,7 +33,7 @@ DRIVE = DriveConfig(updates=(40, 40), update_min_d=0.45, obstacles=12, removed=2
 
 
 @dataclass(frozen=True)
-class Args:
+class DemoArgs:
     """Make a building and a drive through it, carry the robot away unnoticed, find it, and open the page."""
 
     out: Path = Path("dsom-demo")
@@ -48,7 +48,7 @@ class Args:
     """Runs of the filter; the page shows the first."""
 
 
-class Scene(NamedTuple):
+class DemoFiles(NamedTuple):
     """Files of a made drive, and the stamps at which the robot was carried away."""
 
     map: Path
@@ -59,15 +59,16 @@ class Scene(NamedTuple):
 
 def main() -> None:
     """Command line."""
-    args = parse(Args, "python -m dsom_jax.demo")
+    args = parse(DemoArgs, "python -m dsom_jax.demo")
     if not 0 <= args.seed < 2**32:
         raise UserError(f"--seed {args.seed}: give 0 or more, and less than 2^32")
     folder = report.output_folder(args.out)
     with stage("making a building and a drive"):
         scene = make(folder, args.seed)
-    words = localize_args.Args(scene.map, scene.log, folder, reference=scene.reference, runs=args.runs, segments=1,
-                               steps_per_segment=0, laser_max_range=LIDAR.range_max, seed=args.seed,
-                               json=args.json)  # fmt: skip
+    words = localize_args.LocalizeArgs(
+        scene.map, scene.log, folder, reference=scene.reference, runs=args.runs, segments=1, steps_per_segment=0,
+        laser_max_range=LIDAR.range_max, seed=args.seed, json=args.json,
+    )  # fmt: skip
     localize_args.check(words)
     summary = localize.answer(words, scene.carried)
     if args.json:
@@ -78,17 +79,17 @@ def main() -> None:
         print("the page is open in your browser", file=sys.stderr if args.json else sys.stdout)
 
 
-def make(folder: Path, seed: int, building: WorldConfig = BUILDING, drive: DriveConfig = DRIVE) -> Scene:
+def make(folder: Path, seed: int, building: WorldConfig = BUILDING, drive: DriveConfig = DRIVE) -> DemoFiles:
     """Map, bag and reference in ``folder``; the robot meets things that the map does not show."""
     grid = jax.jit(make_world, static_argnums=1)(jax.random.key(seed), building)
     _, episode = make_synthetic(seed, grid, drive)
-    stamps = START + np.asarray(episode.stamps, float)
+    stamps = _START + np.asarray(episode.stamps, float)
     odometry = [np.zeros(3)]
     for increment in np.asarray(episode.odometry, float)[1:]:
         odometry.append(se2.compose(odometry[-1], increment))
     log = RawLog(np.asarray(episode.ranges), np.stack(odometry), stamps, drive.lidar)
-    scene = Scene(folder / "building.yaml", folder / "drive", folder / "truth.tum",
-                  tuple(stamps[np.asarray(jnp.flatnonzero(episode.kidnapped))].tolist()))  # fmt: skip
+    scene = DemoFiles(folder / "building.yaml", folder / "drive", folder / "truth.tum",
+                      tuple(stamps[np.asarray(jnp.flatnonzero(episode.kidnapped))].tolist()))  # fmt: skip
     save_ros_map(grid, scene.map)
     write_bag(scene.log, log)
     save_tum(scene.reference, stamps, np.asarray(episode.poses))

@@ -39,7 +39,7 @@ _UNSEEN = 0x5EE0
 
 
 @dataclass(frozen=True)
-class Args:
+class EvaluateArgs:
     """Judge proposals by single scans: how much of their probability lies where the robot is."""
 
     checkpoint: Path
@@ -73,26 +73,26 @@ Sources = Callable[[int], dict[str, Proposal]]
 
 def main() -> None:
     """Command line."""
-    args = parse(Args, "python -m dsom_jax.evaluate")
-    check(args)
+    args = parse(EvaluateArgs, "python -m dsom_jax.evaluate")
+    _check(args)
     scan = replace(PLAIN, obstacles=(args.obstacles, args.obstacles))
     lidar = narrowed(scan.lidar, args.fov)
     network = checkpoint.load(args.checkpoint, lidar)
     given = given_maps(args, network) if args.maps else None
     folder = report.output_folder(args.out)
     grids = given or new_worlds(args, network)
-    scenes = [simulate(key, grid, scan, lidar, args) for key, grid in grids]
+    scenes = [_simulate(key, grid, scan, lidar, args) for key, grid in grids]
     sources = proposals(scenes, lidar, network)
     with Progress(console=report.terminal(stderr=True)) as progress:
         track = partial(progress.track, description="scenes")
         judged = judge_all(track(scenes), sources)
     results = {name: quality.totals(part) | {"ms_per_scan": ms} for name, (part, ms) in judged.items()}
     report.write_json(folder / "evaluate.json", results)
-    draw(folder, scenes, lidar, sources, {name: part for name, (part, _) in judged.items()})
+    _draw(folder, scenes, lidar, sources, {name: part for name, (part, _) in judged.items()})
     print_table(results)
 
 
-def check(args: Args) -> None:
+def _check(args: EvaluateArgs) -> None:
     """UserError for settings that mean nothing."""
     for name in ("worlds", "scans"):
         if not 1 <= getattr(args, name) <= 100_000:
@@ -113,7 +113,7 @@ def narrowed(lidar: LidarConfig, fov: float) -> LidarConfig:
     return replace(lidar, beams=beams, angle_min=lidar.angle_min + skipped * lidar.angle_increment)
 
 
-def new_worlds(args: Args, network: DSOM) -> list[tuple[Key, OccupancyGrid]]:
+def new_worlds(args: EvaluateArgs, network: DSOM) -> list[tuple[Key, OccupancyGrid]]:
     """Buildings at the network's scale and the keys of their scans."""
     root = jax.random.fold_in(jax.random.key(args.seed), _UNSEEN)
     draw_world = jax.jit(partial(make_world, config=WorldConfig(resolution=network.config.resolution)))
@@ -121,7 +121,7 @@ def new_worlds(args: Args, network: DSOM) -> list[tuple[Key, OccupancyGrid]]:
     return [(k_scans, draw_world(k_world)) for k_world, k_scans in pairs]
 
 
-def given_maps(args: Args, network: DSOM) -> list[tuple[Key, OccupancyGrid]]:
+def given_maps(args: EvaluateArgs, network: DSOM) -> list[tuple[Key, OccupancyGrid]]:
     """Maps at the network's scale and the keys of their scans."""
     grids = load_maps(args.maps, network.config.resolution)
     root = jax.random.fold_in(jax.random.key(args.seed), _UNSEEN)
@@ -134,7 +134,7 @@ def _scans(key: Key, grid: OccupancyGrid, scan: ScanConfig, count: int) -> tuple
     return ranges, grid.from_grid(poses)
 
 
-def simulate(key: Key, grid: OccupancyGrid, scan: ScanConfig, lidar: LidarConfig, args: Args) -> Scene:
+def _simulate(key: Key, grid: OccupancyGrid, scan: ScanConfig, lidar: LidarConfig, args: EvaluateArgs) -> Scene:
     """Scans with unknown obstacles; of a full turn, the beams that ``lidar`` has."""
     ranges, poses = _scans(key, grid, scan, args.scans)
     first = round((lidar.angle_min + math.pi) / lidar.angle_increment)
@@ -180,7 +180,7 @@ def timed(function: Callable[[Array], Any], scans: Array) -> list[float]:
     return seconds
 
 
-def draw(
+def _draw(
     folder: Path, scenes: list[Scene], lidar: LidarConfig, sources: Sources, parts: dict[str, quality.Quality]
 ) -> None:
     """Calibration of all proposals; for the two that are worth it, the worst scans and the first ones."""

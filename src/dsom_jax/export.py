@@ -18,7 +18,7 @@ from dsom_jax.judging.foreign import stamps_of
 
 
 @dataclass(frozen=True)
-class Args:
+class ExportArgs:
     """Write a suite so that other localizers can be run on it: maps, and of each drive a bag and a reference."""
 
     out: Path
@@ -53,7 +53,7 @@ def write_suite(suite: Suite, folder: Path) -> None:
 
 def main() -> None:
     """Command line."""
-    args = parse(Args, "python -m dsom_jax.export")
+    args = parse(ExportArgs, "python -m dsom_jax.export")
     suite = load_suite(args.suite)
     write_suite(suite, report.output_folder(args.out))
     print(

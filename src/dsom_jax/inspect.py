@@ -20,7 +20,7 @@ from dsom_jax.occupancy import OccupancyGrid
 
 
 @dataclass(frozen=True)
-class Args:
+class InspectArgs:
     """Say what is in a log and a map, and find what is wrong with them: mount, signs, scales, clocks, frames."""
 
     log: tyro.conf.Positional[Path]
@@ -37,7 +37,7 @@ class Args:
 
 def main() -> None:
     """Command line."""
-    args = parse(Args, "python -m dsom_jax.inspect")
+    args = parse(InspectArgs, "python -m dsom_jax.inspect")
     if args.json is not None:
         report.output_folder(args.json.parent)
         if args.json.is_dir():
@@ -91,7 +91,7 @@ def lines(result: dict[str, Any]) -> list[str]:
     out += [f"  {note}" for note in log["notes"]]
     if result["map"]:
         out += map_lines(result["map"])
-    out += [f"  {key.replace('_', ' ')}: {numbers(log[key])}" for key in log if key.startswith("scans_against")]
+    out += [f"  {key.replace('_', ' ')}: {_numbers(log[key])}" for key in log if key.startswith("scans_against")]
     out += [Finding(**finding).line() for finding in result["findings"]]
     return out + ([] if result["findings"] else ["nothing found that is wrong"])
 
@@ -107,7 +107,7 @@ def map_lines(described: dict[str, Any]) -> list[str]:
     ]
 
 
-def numbers(found: dict[str, Any]) -> str:
+def _numbers(found: dict[str, Any]) -> str:
     """The numbers of a search on one line."""
     return ", ".join(
         f"{key.replace('_', ' ')} {value:.3g}" if isinstance(value, float) else f"{key.replace('_', ' ')} {value}"

@@ -37,7 +37,7 @@ from dsom_jax.judging.scores import (
 )  # fmt: skip
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.live.replay import Live
-from dsom_jax.localize_args import Args, build, check, drawn_from, load_network, remembers
+from dsom_jax.localize_args import LocalizeArgs, build, check, drawn_from, load_network, remembers
 from dsom_jax.montecarlo import run, run_keys
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.summary_table import print_summary, reference_notes
@@ -49,7 +49,7 @@ from dsom_jax.view.story import DriveStory
 
 def main() -> None:
     """Command line."""
-    args = parse(Args, "python -m dsom_jax.localize")
+    args = parse(LocalizeArgs, "python -m dsom_jax.localize")
     check(args)
     summary = answer(args)
     if args.json:
@@ -58,7 +58,7 @@ def main() -> None:
         print_summary(summary, args.out)
 
 
-def answer(args: Args, carried: Sequence[float] = ()) -> dict[str, Any]:
+def answer(args: LocalizeArgs, carried: Sequence[float] = ()) -> dict[str, Any]:
     """Read, localize, judge and write everything; what ``summary.json`` holds.
 
     ``carried`` are stamps at which the robot is known to have been carried away, which no log tells.
@@ -67,10 +67,10 @@ def answer(args: Args, carried: Sequence[float] = ()) -> dict[str, Any]:
         args = replace(args, runs=1)
     grid, log, notes, findings = read(args)
     lines = [*notes, *(finding.line() for finding in findings)]
-    tell(lines, args)
-    drives = [marked(drive, carried) for drive in cut(log, args)]
+    _tell(lines, args)
+    drives = [marked(drive, carried) for drive in segments_of(log, args)]
     later = few(drives, args)
-    tell(later, args)
+    _tell(later, args)
     others = {name: replies_of(path, drives) for name, path in named(args.external, "FILE.tum").items()}
     on_plan = carried_over(drives, args.reference_on_plan)
     network = load_network(args, log.lidar)
@@ -82,7 +82,7 @@ def answer(args: Args, carried: Sequence[float] = ()) -> dict[str, Any]:
     given = answered(outcomes, args.method)
     summary = summary_of(outcomes, given, grid, args, on_plan, others) | latency
     found = reference_notes(summary, reference_shift(drives, given))
-    tell(found, args)
+    _tell(found, args)
     later += found
     summary |= {"notes": lines + later, "findings": [asdict(finding) for finding in findings]}
     with stage("writing the page"):
@@ -93,7 +93,7 @@ def answer(args: Args, carried: Sequence[float] = ()) -> dict[str, Any]:
     return summary
 
 
-def record(shown: Sequence[DriveStory], grid: OccupancyGrid, lidar: LidarConfig, args: Args) -> None:
+def record(shown: Sequence[DriveStory], grid: OccupancyGrid, lidar: LidarConfig, args: LocalizeArgs) -> None:
     """Write the drives that the page shows as the recordings that are asked for."""
     if args.mcap:
         with stage("writing the recording for Foxglove and ROS 2"):
@@ -112,7 +112,7 @@ class Read(NamedTuple):
     findings: list[Finding]
 
 
-def read(args: Args) -> Read:
+def read(args: LocalizeArgs) -> Read:
     """Map and log, readings beyond ``--laser-max-range`` as no return."""
     left_out = Report()
     grid = load_map(args.map, left_out)
@@ -123,19 +123,19 @@ def read(args: Args) -> Read:
     return Read(grid, limited(log, args.laser_max_range), notes, findings)
 
 
-def tell(notes: list[str], args: Args) -> None:
+def _tell(notes: list[str], args: LocalizeArgs) -> None:
     """Print notes, one a line, where they do not get into the JSON."""
     for note in notes:
         print(one_line(note), file=sys.stderr if args.json else sys.stdout)
 
 
-def cut(log: RawLog, args: Args) -> list[Drive]:
+def segments_of(log: RawLog, args: LocalizeArgs) -> list[Drive]:
     """Segments of the log; with ``--kidnap`` each is followed by the one half the log further."""
     steps = args.steps_per_segment or None
     return pieces.cut(log, args.segments, steps, args.update_min_d, args.update_min_a, args.kidnap)
 
 
-def few(drives: list[Drive], args: Args) -> list[str]:
+def few(drives: list[Drive], args: LocalizeArgs) -> list[str]:
     """A note if a short log holds fewer different segments than were asked for."""
     if len(drives) == args.segments:
         return []
@@ -144,7 +144,7 @@ def few(drives: list[Drive], args: Args) -> list[str]:
 
 
 def driven(
-    filter: Watched, grid: OccupancyGrid, lidar: LidarConfig, drives: list[Drive], args: Args
+    filter: Watched, grid: OccupancyGrid, lidar: LidarConfig, drives: list[Drive], args: LocalizeArgs
 ) -> tuple[list[Outcome], dict[str, Any]]:
     """Outcomes of all drives; with ``--live`` also ``latency_ms``."""
     tracked = each(drives, "segments")
@@ -172,7 +172,7 @@ def summary_of(
     outcomes: list[Outcome],
     given: list[Replies],
     grid: OccupancyGrid,
-    args: Args,
+    args: LocalizeArgs,
     on_plan: list[Drive] | None = None,
     others: Mapping[str, list[Replies]] | None = None,
 ) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from dsom_jax.view.rerun_file import load_rerun
 
 
 @dataclass(frozen=True)
-class Args:
+class LocalizeArgs:
     """Cut a log into segments, start each without any prior, and tell how often the robot is found."""
 
     map: Path
@@ -89,7 +89,7 @@ class Args:
 MANY = 1_000_000
 
 
-def check(args: Args) -> None:
+def check(args: LocalizeArgs) -> None:
     """UserError for settings that mean nothing."""
     for name in ("particles", "runs", "segments", "max_beams", "laser_max_range"):
         if not getattr(args, name) > 0:
@@ -110,7 +110,7 @@ def check(args: Args) -> None:
         raise UserError(f"--segments {args.segments}: --kidnap joins two segments, give at least 2")
 
 
-def check_network(args: Args) -> None:
+def check_network(args: LocalizeArgs) -> None:
     """UserError if a network is needed and none there, or one is named and nothing draws from it."""
     if needs_network(args) and network_folder(args) is None:
         raise UserError(f"--proposal {args.proposal}: give --checkpoint, the folder of a trained network")
@@ -120,7 +120,7 @@ def check_network(args: Args) -> None:
         raise UserError(f"--checkpoint {args.checkpoint}: has no use with {chosen}; {fix}")
 
 
-def check_recordings(args: Args) -> None:
+def check_recordings(args: LocalizeArgs) -> None:
     """UserError if a recording is to be a folder, or a file that its player would not take, or cannot be made."""
     for option, path, suffix in (("--mcap", args.mcap, ".mcap"), ("--rerun", args.rerun, ".rrd")):
         if path is not None and path.suffix.lower() != suffix:
@@ -131,33 +131,33 @@ def check_recordings(args: Args) -> None:
         load_rerun()
 
 
-def drawn_from(args: Args) -> str:
+def drawn_from(args: LocalizeArgs) -> str:
     """Name of the proposal that the filter draws from, whatever the arguments name: MCL's is uniform."""
     return "uniform" if args.method.startswith("mcl") else args.proposal
 
 
-def remembers(args: Args) -> bool:
+def remembers(args: LocalizeArgs) -> bool:
     """Whether the filter remembers earlier scans on the likelihood grid."""
     return args.memory and args.method == "adam_robust" and args.proposal == "likelihood_grid"
 
 
-def needs_network(args: Args) -> bool:
+def needs_network(args: LocalizeArgs) -> bool:
     """Whether the filter draws from a trained network."""
     return drawn_from(args) in ("dsom", "hybrid")
 
 
-def network_folder(args: Args) -> Path | None:
+def network_folder(args: LocalizeArgs) -> Path | None:
     """The checkpoint that is named, else the one that comes with the repository."""
     return args.checkpoint or checkpoint.shipped()
 
 
-def load_network(args: Args, lidar: LidarConfig) -> Any:
+def load_network(args: LocalizeArgs, lidar: LidarConfig) -> Any:
     """The trained network that the arguments ask for, None if nothing draws from one."""
     folder = network_folder(args) if needs_network(args) else None
     return None if folder is None else checkpoint.load(folder, lidar=lidar)
 
 
-def build(args: Args, grid: OccupancyGrid, lidar: LidarConfig, network: Any = None) -> Watched:
+def build(args: LocalizeArgs, grid: OccupancyGrid, lidar: LidarConfig, network: Any = None) -> Watched:
     """The filter that the arguments ask for, with a verdict on its answers."""
     kind = DRAWN if args.map_kind == "drawn" else REAL
     own = ("particles", "t_cut", "max_beams", "seed", "memory")

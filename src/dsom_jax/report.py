@@ -97,7 +97,7 @@ def plain(data: Any) -> Any:
 
 Cell = Callable[[dict[str, Any], float], str]
 """The text of a cell, from M and the milliseconds of a step."""
-COLUMNS: dict[str, Cell] = {
+_COLUMNS: dict[str, Cell] = {
     "converged %": lambda m, _: _percent(m["converged"]) + _interval(m["converged_ci95"], 100),
     "0-20 %": lambda m, _: _percent(m["within_20"]),
     "steps": lambda m, _: _number(m["steps_median"], 0),
@@ -107,19 +107,19 @@ COLUMNS: dict[str, Cell] = {
     "strict %": lambda m, _: _percent(m["strict_success"]),
     "ms/step": lambda _, ms: _number(ms, 1),
 }
-LEGEND = """\
+_LEGEND = """\
 converged: 5 updates in a row within 2 m and 10 deg [95 % interval, by drive]; 0-20: within 20 updates;
 steps: updates before converging, median; E: mean final error of the converged runs;
 kept: share of the later updates still within; strict: last estimate within 0.5 m and 5 deg;
 ms/step: one update of all runs together."""
 
 
-def table(report: dict[str, Any], phase: str) -> Table:
+def _table(report: dict[str, Any], phase: str) -> Table:
     """The results of one phase, one row per method."""
     title = _title(report, phase)
     result = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False)
     result.add_column("method", no_wrap=True)
-    for head in COLUMNS:
+    for head in _COLUMNS:
         result.add_column(head, justify="right", no_wrap=True)
     for name, entry in report["methods"].items():
         result.add_row(name, *_cells(entry, phase))
@@ -130,8 +130,8 @@ def print_tables(report: dict[str, Any], console: Console | None = None) -> None
     """Print one table per phase that was run; 100 columns where the output is no terminal."""
     console = console or terminal()
     for phase in phases_of(report):
-        console.print(table(report, phase), "")
-    console.print(LEGEND, style="dim", highlight=False)
+        console.print(_table(report, phase), "")
+    console.print(_LEGEND, style="dim", highlight=False)
 
 
 def terminal(stderr: bool = False) -> Console:
@@ -144,8 +144,8 @@ def markdown(report: dict[str, Any]) -> str:
     """The same tables for a README."""
     blocks = []
     for phase in phases_of(report):
-        head = ["method", *COLUMNS]
-        rule = ["---", *["---:"] * len(COLUMNS)]
+        head = ["method", *_COLUMNS]
+        rule = ["---", *["---:"] * len(_COLUMNS)]
         rows = [[f"`{name}`", *_cells(entry, phase, intervals=True)] for name, entry in report["methods"].items()]
         lines = ["| " + " | ".join(row) + " |" for row in (head, rule, *rows)]
         blocks.append(f"**{_title(report, phase)}**\n\n" + "\n".join(lines))
@@ -165,7 +165,7 @@ def _title(report: dict[str, Any], phase: str) -> str:
 
 def _cells(entry: dict[str, Any], phase: str, intervals: bool = False) -> list[str]:
     """The row of a method; ``intervals`` of the errors only where there is room for them."""
-    cells = {head: cell(entry[phase], entry["ms_per_step"]) for head, cell in COLUMNS.items()}
+    cells = {head: cell(entry[phase], entry["ms_per_step"]) for head, cell in _COLUMNS.items()}
     if intervals:
         cells["E_pos m"] += _interval(entry[phase]["e_pos_ci95"], 1, 3)
         cells["E_th rad"] += _interval(entry[phase]["e_theta_ci95"], 1, 3)

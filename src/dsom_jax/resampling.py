@@ -17,9 +17,7 @@ def pick(cumulative: Array, positions: Array) -> Array:
 
     Positions are scaled by the last entry, as float32 sums fall short of one, and kept below it.
     """
-    total = cumulative[-1]
-    scaled = jnp.minimum(positions * total, jnp.nextafter(total, jnp.zeros_like(total)))
-    return jnp.searchsorted(cumulative, scaled, side="right", method="scan_unrolled").astype(jnp.int32)
+    return pick_in_rows(cumulative[None], jnp.zeros(positions.shape, jnp.int32), positions)
 
 
 def pick_in_rows(cumulative: Array, rows: Array, positions: Array) -> Array:
@@ -45,7 +43,7 @@ def positions(key: Key, n: int, method: Resampling) -> Array:
     return jax.random.uniform(key, (n,))
 
 
-def resample(key: Key, weights: Array, n: int, method: Resampling = "systematic") -> Array:
+def draw_ancestors(key: Key, weights: Array, n: int, method: Resampling = "systematic") -> Array:
     """(n,) ancestors drawn by ``weights`` (m,), which need not be normalised (Probabilistic Robotics, table 4.4)."""
     return pick(jnp.cumsum(weights), positions(key, n, method))
 
@@ -59,7 +57,7 @@ def soft_resample(key: Key, log_weights: Array, alpha: float, method: Resampling
     n = log_weights.shape[0]
     log_weights = jax.nn.log_softmax(log_weights)
     mixture = alpha * jnp.exp(log_weights) + (1 - alpha) / n
-    ancestors = resample(key, jax.lax.stop_gradient(mixture), n, method)
+    ancestors = draw_ancestors(key, jax.lax.stop_gradient(mixture), n, method)
     # For alpha = 1 a particle of no weight is never drawn, but its 0 / 0 would be everybody's gradient.
     ratio = log_weights - jnp.log(jnp.maximum(mixture, jnp.finfo(mixture.dtype).tiny))
     return ancestors, jax.nn.log_softmax(ratio[ancestors])

@@ -59,13 +59,13 @@ class Claim:
     def read(self) -> dict[str, Any]:
         """What ``owner.json`` holds; nothing where there is none."""
         path = self.folder / OWNER
-        record = checkpoint.read_json(path, "remove it if nothing trains there") if path.is_file() else {}
+        record = checkpoint.read_record(path, "remove it if nothing trains there") if path.is_file() else {}
         return record if isinstance(record, dict) else {}
 
     def write(self) -> None:
         """Write ``owner.json``."""
         who = {"process": os.getpid(), "host": platform.node(), "claim": THIS_PROCESS}
-        checkpoint.write_json(self.folder / OWNER, {**who, "wrote": sorted(self.wrote)})
+        checkpoint.write_record(self.folder / OWNER, {**who, "wrote": sorted(self.wrote)})
 
     def check(self) -> None:
         """UserError if the folder is no longer that of this process: nothing may be written or removed there."""
@@ -113,7 +113,7 @@ class Run:
 
     def write(self) -> None:
         """Write run.json."""
-        checkpoint.write_json(self.out / RUN, self.record())
+        checkpoint.write_record(self.out / RUN, self.record())
 
     def states(self) -> list[Path]:
         """Folders of states, oldest first, without those known to be damaged."""
@@ -220,7 +220,7 @@ def read_fields(path: Path | None) -> dict[str, Any]:
     return {} if path is None else read_yaml(path, "configuration")
 
 
-def create(run: Run) -> None:
+def create_run(run: Run) -> None:
     """The folder of a new run with its run.json."""
     run.hold()
     try:
@@ -252,8 +252,8 @@ def reopen(
     UserError if it is another than ``maps`` and ``steps``, where given, ask for; ``steps`` are those of a run that was
     stopped before it had counted its own.
     """
-    record = checkpoint.read_json(path, "restore it, or give another --out")
-    run = kind(path.parent, None, *checked(record, path))
+    record = checkpoint.read_record(path, "restore it, or give another --out")
+    run = kind(path.parent, None, *_checked(record, path))
     run.config = read_config(record["config"])
     if maps and tuple(map(str, maps)) != run.maps:
         raise UserError(f"--maps: the run in {path} has {', '.join(run.maps) or 'none'}; resume without --maps")
@@ -264,7 +264,7 @@ def reopen(
     return run
 
 
-def checked(record: Any, path: Path) -> tuple[tuple[str, ...], int | None, float, str | None]:
+def _checked(record: Any, path: Path) -> tuple[tuple[str, ...], int | None, float, str | None]:
     """Maps, steps, seconds and ``init`` of a run.json; UserError for a field that is missing or of another kind."""
 
     def fits(name: str, *kinds: type) -> Any:

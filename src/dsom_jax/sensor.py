@@ -222,7 +222,7 @@ def distance_field(grid: OccupancyGrid, model: LikelihoodField) -> Array:
     return jnp.minimum(euclidean_distance(grid.occupied, cap) * grid.resolution, model.max_distance)
 
 
-def interpolate(values: Array, i: Array, j: Array) -> Array:
+def interpolate_cells(values: Array, i: Array, j: Array) -> Array:
     """Bilinear value of ``values`` (H, W) at real-valued cell coordinates, edges extended."""
     i, j = jnp.clip(i, 0, values.shape[0] - 1), jnp.clip(j, 0, values.shape[1] - 1)
     i0, j0 = (jnp.floor(v).astype(jnp.int32) for v in (i, j))
@@ -239,7 +239,7 @@ def field_log_likelihood(
     """Tempered log p(z | x) (...) of one scan (B,) at poses (..., 3); beams without return say nothing here."""
     points, valid = scan_points(ranges, lidar)
     ends = transform_points(grid.to_grid(poses), points) / grid.resolution - 0.5
-    gap = interpolate(distance, ends[..., 1], ends[..., 0])
+    gap = interpolate_cells(distance, ends[..., 1], ends[..., 0])
     density = jnp.exp(-0.5 * (gap / model.sigma_hit) ** 2) / (model.sigma_hit * math.sqrt(2 * math.pi))
     terms = jnp.log(model.z_hit * density + model.z_rand / model.range_max)
     return model.temper * jnp.where(valid, terms, 0.0).sum(-1)

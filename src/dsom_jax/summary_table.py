@@ -12,7 +12,7 @@ from rich.table import Table
 
 from dsom_jax import report
 
-COLUMNS = (
+_COLUMNS = (
     ("runs", "experiments", "{:d}"), ("found", "converged", "{:.1%}"), ("updates", "steps_median", "{:g}"),
     ("metres", "metres_median", "{:.1f}"), ("right later", "retention", "{:.1%}"),
     ("error", "e_pos_m_median", "{:.3f} m"), ("sure and wrong", "false_confident", "{:.2%}"),
@@ -24,7 +24,7 @@ def print_summary(summary: dict[str, Any], folder: Path) -> None:
     """One table for a person, and what to look at."""
     console = report.terminal()
     if "converged" in summary:
-        console.print(table(summary))
+        console.print(_table(summary))
     else:
         sure = f"{summary['updates']} updates, sure of the answer in {summary['certain']:.1%} of them"
         console.print(f"{sure}; no reference to judge by")
@@ -33,11 +33,11 @@ def print_summary(summary: dict[str, Any], folder: Path) -> None:
     console.print(f"look at {folder / 'report.html'}{worst(summary)}", soft_wrap=True, highlight=False)
 
 
-def table(summary: dict[str, Any]) -> Table:
+def _table(summary: dict[str, Any]) -> Table:
     """A row for the start and one for the kidnappings, on either reference, ours and those of others."""
     found = Table(box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 2, 0, 0))
     found.add_column("")
-    for head, _, _ in COLUMNS:
+    for head, _, _ in _COLUMNS:
         found.add_column(head, justify="right")
     parts = [("start anywhere", summary), ("carried away", summary.get("kidnap"))]
     parts += [("on the plan", summary.get("on_plan"))]
@@ -45,7 +45,7 @@ def table(summary: dict[str, Any]) -> Table:
         parts += [(name, theirs), (f"{name}, carried away", theirs.get("kidnap"))]
     for name, part in parts:
         if part and "converged" in part:
-            found.add_row(name, *(_cell(part[key], text) for _, key, text in COLUMNS))
+            found.add_row(name, *(_cell(part[key], text) for _, key, text in _COLUMNS))
     return found
 
 

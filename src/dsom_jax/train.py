@@ -15,9 +15,9 @@ from dsom_jax.errors import UserError, run_cli
 from dsom_jax.judging.quality import make_evaluation
 from dsom_jax.nn import DSOM
 from dsom_jax.occupancy import OccupancyGrid
-from dsom_jax.run_folder import Run, check_init, check_new, create, load_init, read_fields, reopen
+from dsom_jax.run_folder import Run, check_init, check_new, create_run, load_init, read_fields, reopen
 from dsom_jax.trainer import Parts, check_length, train
-from dsom_jax.training.batches import make_batch, plain
+from dsom_jax.training.batches import make_batch, plain_scans
 from dsom_jax.training.loop import (
     TrainConfig,
     TrainState,
@@ -32,7 +32,7 @@ from dsom_jax.training.sharding import data_mesh, replicate, spread
 
 
 @dataclass(frozen=True)
-class Arguments:
+class TrainArgs:
     """Train DSOM.
 
     Attributes:
@@ -73,7 +73,7 @@ def read_config(path: Path | None) -> TrainConfig:
     return override(TrainConfig(), read_fields(path), str(path))
 
 
-def open_run(args: Arguments) -> tuple[Run, Material]:
+def open_run(args: TrainArgs) -> tuple[Run, Material]:
     """A new run in an empty folder, or the one to resume, and what it is made of."""
     path = args.out / "run.json"
     if args.resume and path.exists():
@@ -84,11 +84,11 @@ def open_run(args: Arguments) -> tuple[Run, Material]:
     run = Run(args.out, read_config(args.config), tuple(str(p) for p in args.maps), args.steps, init=begin)
     # Before anything is written: a bad map or checkpoint leaves no folder behind.
     material = read_material(args, run)
-    create(run)
+    create_run(run)
     return run, material
 
 
-def read_material(args: Arguments, run: Run) -> Material:
+def read_material(args: TrainArgs, run: Run) -> Material:
     """Maps and network; a run that has saved a state no longer needs the network that it began with."""
     network = None if run.states() else load_init(args.init, run.config.model)
     # Procedural buildings have the network's scale, and so do maps that are mixed with them.
@@ -96,7 +96,7 @@ def read_material(args: Arguments, run: Run) -> Material:
     return Material(load_maps(tuple(map(Path, run.maps)), run.config.model.resolution, alone), network)
 
 
-def resume_run(args: Arguments, path: Path) -> Run:
+def resume_run(args: TrainArgs, path: Path) -> Run:
     """The run described by run.json."""
     run = reopen(Run, path, lambda given: override(TrainConfig(), given, str(path)), args.maps, args.steps)
     if args.config is not None and read_config(args.config) != run.config:
@@ -113,7 +113,7 @@ def first_state(run: Run, network: DSOM | None) -> TrainState:
 
 def held_out(run: Run, grids: list[OccupancyGrid]) -> Any:
     """Evaluation on full-size buildings that training does not see."""
-    scans = plain(run.config.scan)
+    scans = plain_scans(run.config.scan)
     source = world_source(replace(run.config, scan=scans), run.config.late, grids)
     key = jax.random.key(2**31 - 1 - run.config.seed)
     batch = jax.jit(lambda k: make_batch(k, source, scans, 12, 8, run.config.model))(key)
@@ -134,7 +134,7 @@ def parts(run: Run, material: Material) -> Parts:
 
 def main() -> None:
     """Entry point."""
-    args = parse(Arguments, "python -m dsom_jax.train")
+    args = parse(TrainArgs, "python -m dsom_jax.train")
     keep_freed_memory()
     run, material = open_run(args)
     train(args, run, lambda: parts(run, material))

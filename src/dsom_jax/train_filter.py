@@ -18,7 +18,7 @@ from dsom_jax.errors import UserError, run_cli
 from dsom_jax.judging.tracking import make_tracking
 from dsom_jax.nn import KINDS
 from dsom_jax.occupancy import OccupancyGrid
-from dsom_jax.run_folder import FilterRun, Run, check_init, check_new, create, load_init, read_fields, reopen
+from dsom_jax.run_folder import FilterRun, Run, check_init, check_new, create_run, load_init, read_fields, reopen
 from dsom_jax.trainer import Parts, check_length, train
 from dsom_jax.training.filter_loop import FilterTrainConfig, init_filter_state, make_filter_step, stack_maps
 from dsom_jax.training.memory import keep_freed_memory
@@ -27,7 +27,7 @@ from dsom_jax.training.sequences import make_windows, plan_paths
 
 
 @dataclass(frozen=True)
-class Arguments:
+class TrainFilterArgs:
     """Train PF-Net or PFRNN.
 
     Attributes:
@@ -82,7 +82,7 @@ class Material(NamedTuple):
     network: Any
 
 
-def open_run(args: Arguments) -> tuple[FilterRun, Material]:
+def open_run(args: TrainFilterArgs) -> tuple[FilterRun, Material]:
     """A new run in an empty folder, or the one to resume, and what it is made of."""
     path, out = args.folder / "run.json", args.folder
     if args.resume and path.exists():
@@ -96,17 +96,17 @@ def open_run(args: Arguments) -> tuple[FilterRun, Material]:
     run = FilterRun(out, config, tuple(str(p) for p in args.maps), args.steps, init=begin)
     # Before anything is written: a bad map or checkpoint leaves no folder behind.
     material = read_material(args, run)
-    create(run)
+    create_run(run)
     return run, material
 
 
-def read_material(args: Arguments, run: FilterRun) -> Material:
+def read_material(args: TrainFilterArgs, run: FilterRun) -> Material:
     """Maps and network; a run that has saved a state no longer needs the network that it began with."""
     network = None if run.states() else load_init(args.init, run.config.model, args.filter)
     return Material(training_maps(run.maps, run.config.model.resolution), network)
 
 
-def resume_run(args: Arguments, path: Path) -> FilterRun:
+def resume_run(args: TrainFilterArgs, path: Path) -> FilterRun:
     """The run described by run.json; UserError if it is of another filter or configuration."""
     run = reopen(FilterRun, path, lambda given: args.read_config(given, str(path)), args.maps, args.steps)
     if args.config is not None and args.read_config(read_fields(args.config), str(args.config)) != run.config:
@@ -122,7 +122,7 @@ def first_state(run: Run, network: Any) -> Any:
     return fresh if saved is None else saved
 
 
-def make_batches(run: Run, grids: list[OccupancyGrid]) -> tuple[Callable[[int, int], Any], Any]:
+def _make_batches(run: Run, grids: list[OccupancyGrid]) -> tuple[Callable[[int, int], Any], Any]:
     """(step, total) -> batch of that step, and the maps that are cropped."""
     config, resolution = run.config, grids[0].resolution
     pool, root = plan_paths(config.seed, grids, config.data), jax.random.key(config.seed + 1)
@@ -138,14 +138,14 @@ def make_batches(run: Run, grids: list[OccupancyGrid]) -> tuple[Callable[[int, i
 def parts(run: Run, material: Material) -> Parts:
     """Batches, step and evaluation of a run."""
     grids = [replace(grid, origin=jnp.zeros(3)) for grid in material.grids]
-    batches, places = make_batches(run, grids)
+    batches, places = _make_batches(run, grids)
     step, evaluate = make_filter_step(run.config, places), make_tracking(run.config, grids)
     return Parts(batches, step, evaluate, first_state(run, material.network), ("prediction", "prediction"))
 
 
 def main() -> None:
     """Entry point."""
-    args = parse(Arguments, "python -m dsom_jax.train_filter")
+    args = parse(TrainFilterArgs, "python -m dsom_jax.train_filter")
     keep_freed_memory()
     run, material = open_run(args)
     train(args, run, lambda: parts(run, material))

@@ -154,14 +154,14 @@ def make(folder: Path) -> None:
 def reads_words(folder: Path) -> None:
     """The words of a command line, for each command that knows them, as far as they can be judged without files."""
     words = (folder / "words").read_text(errors="surrogateescape").split()
-    args = parse(localize_args.Args, "python -m dsom_jax.localize", words)
+    args = parse(localize_args.LocalizeArgs, "python -m dsom_jax.localize", words)
     localize_args.check(args)
 
 
 def other_words(folder: Path) -> None:
     """The same, cut short, for one of the other commands."""
     words = (folder / "words").read_text(errors="surrogateescape").split()
-    kinds = (bench.Args, train.Arguments, train_filter.Arguments, evaluate.Args)
+    kinds = (bench.BenchArgs, train.TrainArgs, train_filter.TrainFilterArgs, evaluate.EvaluateArgs)
     parse(kinds[len(" ".join(words)) % len(kinds)], "python -m dsom_jax.bench", words[4:12])
 
 

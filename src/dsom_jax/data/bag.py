@@ -26,7 +26,7 @@ TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 
 
 @dataclass
-class Messages:
+class BagMessages:
     """What was read of a bag, in recording order.
 
     Attributes:
@@ -43,7 +43,7 @@ class Messages:
 
 
 @dataclass(frozen=True)
-class Drive:
+class BagOdometry:
     """Odometry of a bag.
 
     Attributes:
@@ -68,7 +68,7 @@ def load_bag(path: str | Path, options: LogOptions = AS_TOLD, range_max: float |
         topics = {c.topic: c.msgtype for c in reader.connections}
         scan_topic = _scan_topic(path, topics, options)
         if options.reference_topic:
-            choose(path, topics, REFERENCES, options.reference_topic, "reference_topic")
+            _choose(path, topics, REFERENCES, options.reference_topic, "reference_topic")
         odom_topic = _odometry_topic(path, topics, scan_topic, options, report)
         messages = _read(reader, (scan_topic, odom_topic, options.reference_topic), report)
     if not messages.scans:
@@ -81,7 +81,7 @@ def load_bag(path: str | Path, options: LogOptions = AS_TOLD, range_max: float |
     return log if reference is None else replace(log, reference=reference)
 
 
-def choose(path: Path, topics: dict[str, str], kinds: tuple[str, ...], wanted: str | None, name: str) -> str:
+def _choose(path: Path, topics: dict[str, str], kinds: tuple[str, ...], wanted: str | None, name: str) -> str:
     """The topic of one of the message types ``kinds``: the wanted one, or the only one; ``name`` is the option's."""
     found = sorted(topic for topic, msgtype in topics.items() if msgtype in kinds)
     if wanted is not None and wanted in found:
@@ -104,7 +104,7 @@ def _scan_topic(path: Path, topics: dict[str, str], options: LogOptions) -> str:
     if clouds and not set(kinds) & set(topics.values()):
         how = f"ros2 run pointcloud_to_laserscan pointcloud_to_laserscan_node --ros-args -r cloud_in:={clouds[0]}"
         raise UserError(f"{path}: holds point clouds ({clouds[0]}) and no LaserScan; play it, run {how}, record /scan")
-    return choose(path, topics, kinds, options.scan_topic, "scan_topic")
+    return _choose(path, topics, kinds, options.scan_topic, "scan_topic")
 
 
 def _of(topics: dict[str, str], kind: str) -> list[str]:
@@ -122,7 +122,7 @@ def _odometry_topic(
 ) -> str | None:
     """Where the odometry is, None for /tf. Of several topics the only one beside the scans, of the same robot."""
     if options.odom_topic:
-        return choose(path, topics, (ODOMETRY,), options.odom_topic, "odom_topic")
+        return _choose(path, topics, (ODOMETRY,), options.odom_topic, "odom_topic")
     found = [topic for topic in _of(topics, ODOMETRY) if topic != options.reference_topic]
     if options.odom_frame or not found:
         return None
@@ -131,12 +131,12 @@ def _odometry_topic(
         others = ", ".join(topic for topic in found if topic not in beside)
         report.add(f"odometry topic {beside[0]} taken, beside {scan_topic}; --odom-topic chooses another", others)
         return beside[0]
-    return choose(
+    return _choose(
         path, {t: k for t, k in topics.items() if t != options.reference_topic}, (ODOMETRY,), None, "odom_topic"
     )
 
 
-def _read(reader: Any, chosen: tuple[str, str | None, str | None], report: Report) -> Messages:
+def _read(reader: Any, chosen: tuple[str, str | None, str | None], report: Report) -> BagMessages:
     """The messages of the topics chosen (scans, odometry, reference), and the transforms of the scans' robot."""
     scan_topic, odom_topic, reference_topic = chosen
     transforms = [c for c in reader.connections if c.msgtype in TF]
@@ -145,7 +145,7 @@ def _read(reader: Any, chosen: tuple[str, str | None, str | None], report: Repor
     transforms = own if len({_namespace(c.topic) for c in transforms}) > 1 and own else transforms
     wanted = [c for c in reader.connections if c.topic in chosen]
     wanted += [c for c in transforms if c not in wanted]
-    messages = Messages()
+    messages = BagMessages()
     for topic, received, message in messages_of_topics(reader, wanted, report):
         if topic == scan_topic:
             messages.scans.append(message)
@@ -159,7 +159,7 @@ def _read(reader: Any, chosen: tuple[str, str | None, str | None], report: Repor
     return messages
 
 
-def _of_one_lidar(path: Path, messages: Messages, options: LogOptions, report: Report) -> tuple[Messages, str]:
+def _of_one_lidar(path: Path, messages: BagMessages, options: LogOptions, report: Report) -> tuple[BagMessages, str]:
     """The scans of one frame: the one asked for, or the most frequent; and its name as /tf writes it."""
     frames = [message.header.frame_id.lstrip("/") for message in messages.scans]
     counts = Counter(frames)
@@ -178,8 +178,8 @@ def _of_one_lidar(path: Path, messages: Messages, options: LogOptions, report: R
 
 
 def _drive(
-    path: Path, topics: dict[str, str], messages: Messages, laser: str, options: LogOptions, report: Report
-) -> Drive:
+    path: Path, topics: dict[str, str], messages: BagMessages, laser: str, options: LogOptions, report: Report
+) -> BagOdometry:
     """The odometry of the topic, or of the edge of /tf that is odometry."""
     tree = messages.tree
     if messages.odometry:
@@ -188,7 +188,7 @@ def _drive(
         frame, base = first.header.frame_id.lstrip("/"), first.child_frame_id.lstrip("/")
         edge = tree.odometry_edge(laser)
         return _of_base(
-            Drive(rows, frame or None, base or (edge[1] if edge else "base_link")), messages, options, report
+            BagOdometry(rows, frame or None, base or (edge[1] if edge else "base_link")), messages, options, report
         )
     edge = tree.odometry_edge(laser, options.odom_frame)
     if edge is None:
@@ -206,10 +206,10 @@ def _drive(
         report.add(f"odometry taken from /tf: {edge[0]} -> {edge[1]}; --odom-frame chooses another")
     if last_name(edge[0]) in FIXED:
         report.add(f"odometry of the fixed frame {edge[0]}: it may be corrected already, and what is found too good")
-    return _of_base(Drive(rows, edge[0], edge[1]), messages, options, report)
+    return _of_base(BagOdometry(rows, edge[0], edge[1]), messages, options, report)
 
 
-def _of_base(drive: Drive, messages: Messages, options: LogOptions, report: Report) -> Drive:
+def _of_base(drive: BagOdometry, messages: BagMessages, options: LogOptions, report: Report) -> BagOdometry:
     """The odometry of ``--base-frame``, where that is another frame than the one that the odometry moves."""
     base = options.base_frame.lstrip("/") if options.base_frame else drive.base
     if base == drive.base:
@@ -218,7 +218,7 @@ def _of_base(drive: Drive, messages: Messages, options: LogOptions, report: Repo
     if sits is None:
         report.add(f"missing transform {drive.base} -> {base}: the odometry is taken to be that of {base}")
         return replace(drive, base=base)
-    return Drive(_shifted(drive.rows, np.array([sits.x, sits.y, sits.yaw])), drive.frame, base)
+    return BagOdometry(_shifted(drive.rows, np.array([sits.x, sits.y, sits.yaw])), drive.frame, base)
 
 
 def _shifted(rows: np.ndarray, pose: np.ndarray) -> np.ndarray:
@@ -227,7 +227,7 @@ def _shifted(rows: np.ndarray, pose: np.ndarray) -> np.ndarray:
 
 
 def _sensor(
-    messages: Messages, laser: str, drive: Drive, range_max: float | None, options: LogOptions, report: Report
+    messages: BagMessages, laser: str, drive: BagOdometry, range_max: float | None, options: LogOptions, report: Report
 ) -> Sensor:
     """Limits that the scans tell, and where the lidar sits by /tf."""
     first, tree, base = messages.scans[0], messages.tree, drive.base
@@ -247,7 +247,7 @@ def _sensor(
     return Sensor(float(first.range_min), range_max or told, float(first.scan_time), *where)
 
 
-def _table(messages: Messages, report: Report) -> Scans:
+def _table(messages: BagMessages, report: Report) -> Scans:
     """The scan messages as arrays."""
     scans = messages.scans
     echoes = scans[0].__msgtype__ == ECHOES

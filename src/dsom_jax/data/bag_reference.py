@@ -10,7 +10,7 @@ import numpy as np
 from dsom_jax.data import se2
 from dsom_jax.data.log import Report
 from dsom_jax.data.log_options import LogOptions
-from dsom_jax.data.tf_tree import HOLD, TfTree, at_stamps, planar, pose_row, stamp_of
+from dsom_jax.data.tf_tree import MAX_GAP, TfTree, at_stamps, planar, pose_row, stamp_of
 from dsom_jax.errors import UserError
 
 STAMPED = "geometry_msgs/msg/PoseStamped"
@@ -43,7 +43,7 @@ def reference_of(
         return None
     missing = int(np.isnan(poses).any(-1).sum())
     if missing == len(stamps):
-        raise UserError(f"{path}: {name} tells no pose within {HOLD:g} s of any scan; both must use the same clock")
+        raise UserError(f"{path}: {name} tells no pose within {MAX_GAP:g} s of any scan; both must use the same clock")
     if missing:
         report.add("scans without a reference pose", count=missing)
     return poses
@@ -63,7 +63,7 @@ def _of_topic(path: Path, messages: list[Any], drive: Any, stamps: np.ndarray, t
     carried = [se2.compose(rows[side, 1:], se2.relative(there[side], here)) for side in sides]
     gaps = np.stack([np.abs(stamps - rows[side, 0]) for side in sides])
     # The nearer pose counts for more; one that is too far away, not at all.
-    weights = np.where(gaps <= HOLD, 1 / (gaps + 1e-9), 0.0)
+    weights = np.where(gaps <= MAX_GAP, 1 / (gaps + 1e-9), 0.0)
     known = weights.sum(axis=0) > 0
     part = weights[1] / np.where(known, weights.sum(axis=0), 1.0)
     between = carried[1] - carried[0]
@@ -92,4 +92,4 @@ def _of_tf(path: Path, tree: TfTree, drive: Any, stamps: np.ndarray, fixed: str)
             f"{path}: --reference-tf {fixed}: /tf does not connect it with {drive.base}; it knows {frames or 'none'}"
         )
     odometry = drive.rows[np.unique(drive.rows[:, 0], return_index=True)[1]]
-    return se2.compose(frame, at_stamps(odometry, stamps, HOLD))
+    return se2.compose(frame, at_stamps(odometry, stamps, MAX_GAP))

@@ -41,11 +41,11 @@ ALIKE = 0.2
 """Scans of one lidar differ by at most this share in number and angles of their beams; others are of another lidar."""
 FINEST = 1e-4
 """Radians between beams; no lidar has less."""
-T = TypeVar("T")
+_T = TypeVar("_T")
 
 
 @dataclass
-class Messages:
+class CarmenMessages:
     """What the lines of a log say: one entry for each scan in ``ranges``, ``poses`` (laser, then odometry: (6,)) and
     ``stamps``; ``odometry`` rows are (stamp, x, y, theta)."""
 
@@ -65,7 +65,7 @@ def load_carmen(path: str | Path, options: LogOptions = AS_TOLD, range_max: floa
     from the log's own messages, or is detected (see :func:`dsom_jax.data.range_codes.detect_no_return`).
     """
     path = Path(path)
-    messages = parse(read_lines(path, "log"))
+    messages = _parse(read_lines(path, "log"))
     if not messages.stamps:
         raise UserError(
             f"{path}: holds no FLASER, ROBOTLASER1 or RAWLASER1 line, so it is not a CARMEN log of a front laser"
@@ -81,9 +81,9 @@ def load_carmen(path: str | Path, options: LogOptions = AS_TOLD, range_max: floa
     return tidy(RawLog(ranges, odometry, stamps, lidar, reference, messages.report, path, broken))
 
 
-def parse(lines: list[str]) -> Messages:
+def _parse(lines: list[str]) -> CarmenMessages:
     """Messages of a log; what cannot be read is counted in the report."""
-    messages = Messages()
+    messages = CarmenMessages()
     # Logs may hold the same scan raw and with the robot's pose: the one with the pose is enough.
     present = {line.split(None, 1)[0] for line in lines if not line.isspace() and line}
     wanted = next((kind for kind in WITH_POSE + WITHOUT_POSE if kind in present), None)
@@ -98,7 +98,7 @@ def parse(lines: list[str]) -> Messages:
     return messages
 
 
-def _message(messages: Messages, words: list[str], wanted: str | None) -> None:
+def _message(messages: CarmenMessages, words: list[str], wanted: str | None) -> None:
     """Enter one line; ValueError or IndexError if it is malformed."""
     kind = words[0]
     if kind == wanted:
@@ -116,7 +116,7 @@ def _message(messages: Messages, words: list[str], wanted: str | None) -> None:
         raise ValueError("not a message")
 
 
-def _scan(messages: Messages, words: list[str]) -> None:
+def _scan(messages: CarmenMessages, words: list[str]) -> None:
     """Enter a laser message of any of the four forms."""
     kind = words[0]
     config, rest = (None, words[1:]) if kind in ("FLASER", "LASER") else (_config(words), words[8:])
@@ -147,7 +147,7 @@ def _config(words: list[str]) -> LaserConfig:
     return LaserConfig(start, resolution, maximum)
 
 
-def _of_one_lidar(messages: Messages, path: Path) -> tuple[np.ndarray, np.ndarray, LaserConfig]:
+def _of_one_lidar(messages: CarmenMessages, path: Path) -> tuple[np.ndarray, np.ndarray, LaserConfig]:
     """Which scans (M,) bool are of the lidar, their ranges (N, B) on the same beams, and the geometry of these."""
     counts = np.array([len(scan) for scan in messages.ranges])
     start, step = (np.array([getattr(c, name) for c in messages.configs]) for name in ("start_angle", "resolution"))
@@ -166,7 +166,7 @@ def _of_one_lidar(messages: Messages, path: Path) -> tuple[np.ndarray, np.ndarra
     return keep, ranges, replace(_chosen(messages.configs, keep)[0], start_angle=beams.start, resolution=beams.step)
 
 
-def _chosen(rows: Sequence[T], keep: np.ndarray) -> list[T]:
+def _chosen(rows: Sequence[_T], keep: np.ndarray) -> list[_T]:
     """The rows that are kept."""
     return [row for row, kept in zip(rows, keep, strict=True) if kept]
 
@@ -190,7 +190,7 @@ def _alike(counts: np.ndarray, start: np.ndarray, step: np.ndarray, report: Repo
 
 
 def _poses(
-    messages: Messages, keep: np.ndarray, stamps: np.ndarray, path: Path
+    messages: CarmenMessages, keep: np.ndarray, stamps: np.ndarray, path: Path
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, np.ndarray | None]:
     """Odometry (N, 3) at the scans and where it jumped (N,), the mount (3,) if the log tells it, and the corrected
     poses of the laser (N, 3)."""

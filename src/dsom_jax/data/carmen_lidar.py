@@ -21,7 +21,7 @@ INCREMENT_DEG = {181: 1.0, 180: 1.0, 361: 0.5, 360: 0.5, 401: 0.25, 400: 0.25}
 
 
 Radians = Annotated[float, Meta(ge=-2 * math.pi - 1e-3, le=2 * math.pi + 1e-3)]
-Metres = Annotated[float, Meta(ge=-100, le=100)]
+_Metres = Annotated[float, Meta(ge=-100, le=100)]
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class LogMeta:
     range_min: Annotated[float | None, Meta(description="a number of metres")] = None
     range_no_return: Annotated[float | None, Meta(description="a number of metres")] = None
     mount: Annotated[
-        tuple[Metres, Metres, Radians] | None,
+        tuple[_Metres, _Metres, Radians] | None,
         Meta(description="[x, y, yaw] in metres and radians, at most 100 m and one turn (90 deg is 1.5708)"),
     ] = None
     upside_down: Annotated[bool | None, Meta(description="true or false")] = None

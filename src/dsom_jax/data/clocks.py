@@ -8,7 +8,7 @@ import numpy as np
 
 RATE = 20.0
 """Hz at which the turn rates are compared."""
-LONGEST = 200_000
+_LONGEST = 200_000
 """Samples at most; of longer logs the beginning."""
 LEAST = 0.1
 """Seconds below which an offset is not worth a word."""
@@ -90,6 +90,6 @@ def convolved(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def _sampled(times: np.ndarray, angle: np.ndarray) -> np.ndarray:
     """Rates of an angle, one in 1 / RATE seconds."""
-    span = min(times[-1] - times[0], LONGEST / RATE)
+    span = min(times[-1] - times[0], _LONGEST / RATE)
     at = times[0] + np.arange(int(span * RATE) + 1) / RATE
     return np.diff(np.interp(at, times, angle)) if len(at) > 1 else np.zeros(1)

@@ -19,7 +19,7 @@ import yaml
 from dsom_jax.data.files import MB, read_text
 from dsom_jax.errors import UserError, shown
 
-T = TypeVar("T")
+_T = TypeVar("_T")
 DEPTH, VALUES = 24, 2_000_000
 """Most levels of lists and mappings within each other, and most values in all."""
 DIGITS = 2**63
@@ -194,7 +194,7 @@ _SCALARS: dict[str, Callable[[str, str], Any]] = {
 }
 
 
-def fields_as(kind: type[T], fields: Mapping[str, Any], path: str | Path, *, others: bool = True) -> T:
+def fields_as(kind: type[_T], fields: Mapping[str, Any], path: str | Path, *, others: bool = True) -> _T:
     """The dataclass ``kind`` from ``fields``; UserError naming the file, the field, its value and what it must be.
 
     What a field must be is the description that ``msgspec.Meta`` gives it. ``others``: fields that it lacks are left

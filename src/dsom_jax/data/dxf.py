@@ -28,7 +28,7 @@ UNITS = {"mm": 0.001, "cm": 0.01, "dm": 0.1, "m": 1.0, "km": 1000.0, "in": 0.025
 """Metres."""
 INSUNITS = {1: "in", 2: "ft", 4: "mm", 5: "cm", 6: "m", 7: "km", 10: "yd", 14: "dm"}
 """Codes of the header variable $INSUNITS (DXF reference); 0 says nothing."""
-DRAWN = ("LINE", "LWPOLYLINE", "POLYLINE", "ARC", "CIRCLE", "ELLIPSE", "SPLINE", "SOLID", "TRACE", "3DFACE")
+_DRAWN = ("LINE", "LWPOLYLINE", "POLYLINE", "ARC", "CIRCLE", "ELLIPSE", "SPLINE", "SOLID", "TRACE", "3DFACE")
 MAX_SIDE = 100_000
 """Cells along one side of a map."""
 MAX_INSERTED, MAX_LINES = 250_000, 1_000_000
@@ -246,7 +246,7 @@ def _visible(document: Any, entities: Any, drawing: Drawing, report: Report, lay
             continue
         elif kind == "MLINE":
             yield from _visible(document, entity.virtual_entities(), drawing, report, name)
-        elif kind in DRAWN:
+        elif kind in _DRAWN:
             if kind == "LWPOLYLINE" and entity.has_width:
                 report.add("polylines with a width, of which the middle line is drawn")
             yield entity

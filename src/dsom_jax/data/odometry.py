@@ -9,11 +9,11 @@ import numpy as np
 from dsom_jax.data import se2
 from dsom_jax.data.log import Report
 
-MAX_GAP = 1.0
+_MAX_GAP = 1.0
 """Seconds without odometry that are not bridged by interpolation."""
 MAX_OVERHANG = 0.2
 """Seconds before the first or after the last odometry for which that one is used."""
-FAR = 1e7
+_FAR = 1e7
 """Metres beyond which a position is none."""
 SLACK, FAST = (0.1, 0.2), (2.0, 3.0)
 """A step of more than SLACK + 3 x what is usual in this odometry (at least FAST) per second is no motion: m, rad."""
@@ -41,7 +41,7 @@ class Odometry:
         gaps = np.diff(times, append=times[-1])[after - 1]
         inside = (stamps >= times[0]) & (stamps <= times[-1])
         near = (stamps >= times[0] - MAX_OVERHANG) & (stamps <= times[-1] + MAX_OVERHANG)
-        return np.where(np.where(inside, gaps <= MAX_GAP, near)[:, None], poses, np.nan)
+        return np.where(np.where(inside, gaps <= _MAX_GAP, near)[:, None], poses, np.nan)
 
     def broken(self, stamps: np.ndarray) -> np.ndarray:
         """(N,) bool: scans between which and the scan before them, by stamp, the odometry jumped."""
@@ -58,7 +58,7 @@ def mended(rows: np.ndarray, report: Report) -> Odometry:
     A single row beside the way is dropped; where the poses go on elsewhere, as after a reset, they are carried over so
     that the motion across the jump is zero.
     """
-    sound = np.isfinite(rows).all(-1) & (np.abs(rows[:, 1:3]) < FAR).all(-1)
+    sound = np.isfinite(rows).all(-1) & (np.abs(rows[:, 1:3]) < _FAR).all(-1)
     if not sound.all():
         report.add("odometry messages that are not finite dropped", count=int((~sound).sum()))
     rows = rows[sound]

@@ -37,16 +37,16 @@ MOUNTS = {"FRONT": (0.08, 0.0, 0.0), "REAR": (-0.463, 0.001, math.pi)}
 """Poses of the two lasers on the base: "Calibration 04" in launch/transforms_biccoca.launch of ``rawseds_ros``."""
 NO_RETURN = 81.825
 """Metres: a SICK that counts centimetres writes 81.83 to 81.91 where it has seen nothing."""
-SUFFIXES = (".csv", ".csv.bz2", ".csv.gz")
+_SUFFIXES = (".csv", ".csv.bz2", ".csv.gz")
 ODOMETRY, GROUND_TRUTH = "-ODOMETRY_XYT", ("-GT-extended", "-GROUNDTRUTH")
-MAX_GAP = 2.0
+_MAX_GAP = 2.0
 """Seconds between poses of the ground truth that are bridged: GT-extended has one for each half metre."""
 
 
 def is_rawseeds(path: str | Path) -> bool:
     """Whether a path looks like a SICK file of Rawseeds, or a folder that holds one."""
     path = Path(path)
-    return any(_scan_files(path)) if path.is_dir() else path.name.lower().endswith(SUFFIXES)
+    return any(_scan_files(path)) if path.is_dir() else path.name.lower().endswith(_SUFFIXES)
 
 
 def load_rawseeds(path: str | Path, options: LogOptions = AS_TOLD, range_max: float | None = None) -> RawLog:
@@ -71,7 +71,7 @@ def load_rawseeds(path: str | Path, options: LogOptions = AS_TOLD, range_max: fl
 def _scan_files(folder: Path) -> Iterator[Path]:
     """The SICK files of a folder, those of the front laser first."""
     for laser in MOUNTS:
-        yield from sorted(p for s in SUFFIXES for p in folder.glob(f"*-SICK_{laser}{s}"))
+        yield from sorted(p for s in _SUFFIXES for p in folder.glob(f"*-SICK_{laser}{s}"))
 
 
 def _scan_file(path: Path) -> Path:
@@ -91,7 +91,7 @@ def _scan_file(path: Path) -> Path:
 
 def _sibling(path: Path, session: str, kind: str) -> Path:
     """Another file of the session."""
-    for suffix in SUFFIXES:
+    for suffix in _SUFFIXES:
         if (other := path.with_name(f"{session}{kind}{suffix}")).is_file():
             return other
     raise UserError(f"{path}: needs {session}{kind}.csv beside it; put the session's files into one folder")
@@ -185,7 +185,7 @@ def _reference(path: Path, session: str, stamps: np.ndarray, report: Report) -> 
         except UserError:
             continue
         rows = _rows(file, 4, (0, 1, 2, 3), report)
-        poses = associate(Trajectory(rows[:, 0], rows[:, 1:]), stamps, max_gap=MAX_GAP)
+        poses = associate(Trajectory(rows[:, 0], rows[:, 1:]), stamps, max_gap=_MAX_GAP)
         if missing := int(np.isnan(poses).any(-1).sum()):
             report.add(f"scans without a pose in {file.name}", count=missing)
         return poses

@@ -42,7 +42,7 @@ BLOCK = 1 << 22
 """Pixels that are looked at in one go, so that no copy is larger than the picture."""
 
 Share = Annotated[float, Meta(ge=0, le=1)]
-Metres = Annotated[float, Meta(ge=-1e12, le=1e12)]
+_Metres = Annotated[float, Meta(ge=-1e12, le=1e12)]
 Yaw = Annotated[float, Meta(ge=-2 * math.pi, le=2 * math.pi)]
 
 
@@ -63,7 +63,7 @@ class MapInfo:
     image: Annotated[Path, Meta(description="the name of the picture, pgm or png, beside the yaml")]
     resolution: Annotated[float, Meta(ge=1e-3, le=10, description="a number of metres per pixel from 0.001 to 10")]
     origin: Annotated[
-        tuple[Metres, Metres, Yaw],
+        tuple[_Metres, _Metres, Yaw],
         Meta(description="three numbers [x, y, yaw] in metres and radians, yaw within one turn: 90 deg is 1.5708"),
     ]
     occupied_thresh: Annotated[Share, Meta(description="a number from 0 to 1, such as 0.65")]

@@ -15,9 +15,9 @@ Edge = tuple[str, str]
 """Parent and child frame."""
 FIXED = ("map", "world", "earth")
 """Names of frames that stand still, whose child is moved by a localization and not by odometry."""
-STILL = (0.01, np.radians(0.5))
+_STILL = (0.01, np.radians(0.5))
 """Metres and radians that a transform may differ over a log and still be called fixed."""
-HOLD = 5.0
+MAX_GAP = 5.0
 """Seconds between two transforms that are bridged by interpolation."""
 
 
@@ -119,7 +119,7 @@ class TfTree:
 
     def moves(self, edge: Edge) -> bool:
         """Whether the transform changes over the log."""
-        return any(found > still for found, still in zip(self.extent(edge), STILL, strict=True))
+        return any(found > still for found, still in zip(self.extent(edge), _STILL, strict=True))
 
     def above(self, frame: str) -> Edge | None:
         """The edge to the parent. Of several parents the one named after odometry, then the one told most often."""
@@ -208,7 +208,7 @@ class TfTree:
         rows = self.rows(edge)
         if not self.moves(edge):
             return np.broadcast_to(rows[0, 1:] if len(rows) else np.full(3, np.nan), (len(stamps), 3))
-        return at_stamps(rows, stamps, HOLD)
+        return at_stamps(rows, stamps, MAX_GAP)
 
 
 def at_stamps(rows: np.ndarray, stamps: np.ndarray, hold: float) -> np.ndarray:

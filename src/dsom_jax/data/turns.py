@@ -12,7 +12,7 @@ WIDEST = math.pi / 3
 """Radians between two scans that are searched at most."""
 BEAMS = 360
 """Scans are thinned to about so many beams."""
-MOST = 4000
+_MOST = 4000
 """Pairs of scans that are compared; of longer logs those in the middle."""
 
 
@@ -60,5 +60,5 @@ def _difference(profile: np.ndarray, known: np.ndarray, shift: int, circle: bool
 
 def middle_of(count: int) -> slice:
     """The scans of a log of ``count`` that are compared."""
-    start = max(0, (count - MOST) // 2)
-    return slice(start, start + MOST)
+    start = max(0, (count - _MOST) // 2)
+    return slice(start, start + _MOST)

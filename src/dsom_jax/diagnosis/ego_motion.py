@@ -25,8 +25,8 @@ MATCHED = 0.5
 LAGS = 90.0
 """Seconds by which clocks may differ."""
 
-Variant = Literal["as is", "mirrored", "yaw negated"]
-VARIANTS: dict[Variant, tuple[float, float]] = {"as is": (1, 1), "mirrored": (-1, -1), "yaw negated": (1, -1)}
+OdometryVariant = Literal["as is", "mirrored", "yaw negated"]
+VARIANTS: dict[OdometryVariant, tuple[float, float]] = {"as is": (1, 1), "mirrored": (-1, -1), "yaw negated": (1, -1)}
 """Signs of y and of the heading of the odometry's poses."""
 
 
@@ -49,7 +49,7 @@ class Steps(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Motion:
+class EgoMotion:
     """How the odometry relates to the scans.
 
     Attributes:
@@ -67,7 +67,7 @@ class Motion:
         frozen: share of the moving steps in which the odometry stands still.
     """
 
-    variant: Variant
+    variant: OdometryVariant
     agreement: float
     as_is: float
     lag: float
@@ -108,7 +108,7 @@ def matched_steps(log: RawLog, pairs: int = PAIRS, blocks: int = BLOCKS) -> Step
     )
 
 
-def odometry_moves(log: RawLog, steps: Steps, lag: float = 0.0, variant: Variant = "as is") -> np.ndarray:
+def odometry_moves(log: RawLog, steps: Steps, lag: float = 0.0, variant: OdometryVariant = "as is") -> np.ndarray:
     """(n, 3) what the odometry says of the steps; NaN where the log does not cover the stamps."""
     poses = log.odometry * [1, *VARIANTS[variant]]
     if lag == 0:
@@ -140,14 +140,14 @@ def mean_cost(costs: np.ndarray) -> float:
     return float(known.mean()) if len(known) else 1.0
 
 
-def find_lag(log: RawLog, steps: Steps, variant: Variant) -> tuple[float, float]:
+def find_lag(log: RawLog, steps: Steps, variant: OdometryVariant) -> tuple[float, float]:
     """(lag, gain): the shift of the clock under which the turns agree best, and by which share the cost falls.
 
     The odometry is looked up at the scans' shifted stamps, and the scans' own heading at the odometry's: where stamps
     lie seconds apart only the one of the two that was not interpolated when the log was written is sharp. The gain is
     0 where the difference is within five standard errors of chance.
     """
-    turning = select(steps, steps.good & (np.abs(steps.moves[:, 2]) > 0.06))
+    turning = _select(steps, steps.good & (np.abs(steps.moves[:, 2]) > 0.06))
     if len(turning.pairs) < 15:
         return 0.0, 0.0
     dt = float(np.median(np.diff(np.unique(log.stamps))))
@@ -192,12 +192,12 @@ def scan_heading(log: RawLog, steps: Steps) -> tuple[np.ndarray, np.ndarray]:
     return np.array(stamps[1:]), np.array(heading[1:])
 
 
-def select(steps: Steps, keep: np.ndarray) -> Steps:
+def _select(steps: Steps, keep: np.ndarray) -> Steps:
     """The steps ``keep``."""
     return Steps(*(column[keep] for column in steps))
 
 
-class Fit(NamedTuple):
+class LinearFit(NamedTuple):
     """Linear fit of the sensor's moves to the odometry's: yaw, scales, and the share of steps that agree with it."""
 
     yaw: float
@@ -207,7 +207,7 @@ class Fit(NamedTuple):
     sd: float
 
 
-def fit_mount(steps: Steps, odometry: np.ndarray) -> Fit:
+def fit_mount(steps: Steps, odometry: np.ndarray) -> LinearFit:
     """Yaw of the sensor and scale of distances from the steps (n) and the odometry's moves (n, 3).
 
     The sensor's translation is R(-yaw) [s d + (R(turn) - 1) m] with the base's move d and the mount m: linear in
@@ -235,7 +235,7 @@ def fit_mount(steps: Steps, odometry: np.ndarray) -> Fit:
     right = (size < tolerance) & (np.abs(turn - odometry[:, 2]) < 0.05 + 0.2 * np.abs(turn))
     used = np.linalg.inv(normal) * (weight * size**2).sum() / max(weight.sum(), 1) / 2
     sd = float(np.sqrt(np.trace(used[:2, :2]) / 2)) / max(scale, 1e-3)
-    return Fit(float(np.arctan2(found[1], found[0])), scale, ratio, float(right.mean()), sd)
+    return LinearFit(float(np.arctan2(found[1], found[0])), scale, ratio, float(right.mean()), sd)
 
 
 def moving(steps: Steps) -> np.ndarray:
@@ -246,32 +246,32 @@ def moving(steps: Steps) -> np.ndarray:
     return steps.good & ((size > 0.05) | (np.abs(steps.moves[:, 2]) > 0.05))
 
 
-def ego_motion(log: RawLog, steps: Steps) -> Motion:
+def ego_motion(log: RawLog, steps: Steps) -> EgoMotion:
     """What the odometry has to be corrected by to agree with the scans."""
-    went = select(steps, moving(steps))
+    went = _select(steps, moving(steps))
     own = odometry_moves(log, went)
     still = (np.hypot(own[:, 0], own[:, 1]) < 0.01) & (np.abs(own[:, 2]) < 0.01)
     if len(still) < 15 or still.mean() > 0.9:
         share = float(still.mean()) if len(still) else np.nan
-        return Motion("as is", np.nan, np.nan, 0.0, 0.0, np.nan, np.nan, np.nan, np.nan, np.nan,
-                      int(steps.good.sum()), len(still), share)  # fmt: skip
-    driven = select(went, ~still)
-    found: dict[Variant, tuple[float, float, Fit]] = {}
+        return EgoMotion("as is", np.nan, np.nan, 0.0, 0.0, np.nan, np.nan, np.nan, np.nan, np.nan,
+                        int(steps.good.sum()), len(still), share)  # fmt: skip
+    driven = _select(went, ~still)
+    found: dict[OdometryVariant, tuple[float, float, LinearFit]] = {}
     for variant in VARIANTS:
         lag, gain = find_lag(log, driven, variant)
         # A lag is believed where it explains the turns; otherwise the search only finds luck.
         lag = lag if gain > 0.1 else 0.0
         moves = odometry_moves(log, driven, lag, variant)
         known = np.isfinite(moves).all(1)
-        found[variant] = (lag, gain, fit_mount(select(driven, known), moves[known]))
-    best: Variant = max(found, key=lambda v: found[v][2].agreement + 0.1 * (v == "as is"))
+        found[variant] = (lag, gain, fit_mount(_select(driven, known), moves[known]))
+    best: OdometryVariant = max(found, key=lambda v: found[v][2].agreement + 0.1 * (v == "as is"))
     lag, gain, fit = found[best]
     plain = fit_mount(driven, own[~still])
-    return Motion(best, fit.agreement, plain.agreement, lag, gain, fit.turn_scale, fit.distance_scale, fit.yaw, fit.sd,
-                  fit.sd, int(steps.good.sum()), len(went.pairs), float(still.mean()))  # fmt: skip
+    return EgoMotion(best, fit.agreement, plain.agreement, lag, gain, fit.turn_scale, fit.distance_scale, fit.yaw,
+                     fit.sd, fit.sd, int(steps.good.sum()), len(went.pairs), float(still.mean()))  # fmt: skip
 
 
-def pieces_of(log: RawLog, steps: Steps, motion: Motion, way: float = 5.0) -> list[Piece]:
+def pieces_of(log: RawLog, steps: Steps, motion: EgoMotion, way: float = 5.0) -> list[Piece]:
     """The blocks of matched steps as pieces of the drive; the first ``way`` metres of each are for the search."""
     trusted = motion.agreement > 0.7
     odometry = odometry_moves(log, steps, motion.lag, motion.variant)
@@ -285,7 +285,7 @@ def pieces_of(log: RawLog, steps: Steps, motion: Motion, way: float = 5.0) -> li
         own = np.flatnonzero(steps.block == number)
         for k in own:
             guess = carried[k] if trusted and np.isfinite(carried[k]).all() else None
-            move = joined(steps.moves[k], steps.information[k], guess) if steps.good[k] else guess
+            move = _joined(steps.moves[k], steps.information[k], guess) if steps.good[k] else guess
             if move is None:
                 break
             chain.append(se2.compose(chain[-1], move))
@@ -298,7 +298,7 @@ def pieces_of(log: RawLog, steps: Steps, motion: Motion, way: float = 5.0) -> li
     return pieces
 
 
-def joined(move: np.ndarray, information: np.ndarray, guess: np.ndarray | None) -> np.ndarray:
+def _joined(move: np.ndarray, information: np.ndarray, guess: np.ndarray | None) -> np.ndarray:
     """The move (3,) of a match, held by the odometry's ``guess`` in directions in which the scans say little."""
     if guess is None:
         return move

@@ -18,9 +18,9 @@ from dsom_jax.data import se2
 from dsom_jax.data.bag_file import is_bag
 from dsom_jax.data.log import RawLog
 from dsom_jax.diagnosis import map_fit
-from dsom_jax.diagnosis.ego_motion import Motion, Steps, ego_motion, matched_steps, pieces_of
+from dsom_jax.diagnosis.ego_motion import EgoMotion, Steps, ego_motion, matched_steps, pieces_of
 from dsom_jax.diagnosis.findings import Finding, Severity, ordered
-from dsom_jax.diagnosis.map_fit import Geometry, MapField, Piece, Place, Scans
+from dsom_jax.diagnosis.map_fit import Geometry, MapField, Piece, Place, Thinned
 from dsom_jax.diagnosis.matching import Reference, bearings, match, points_of
 from dsom_jax.diagnosis.symptoms import cheap_findings, jump_finding, suspects
 from dsom_jax.occupancy import OccupancyGrid
@@ -29,7 +29,7 @@ HOLDS = 0.5
 """A piece lies where it was put if its later scans agree with the map so much more often than they go through walls."""
 SCALES = (0.9, 1.11, 0.8, 1.25)
 FAR_SCALES = (0.5, 0.63, 1.6, 2.0)
-PIECES = 5
+_PIECES = 5
 """Pieces that are tried under unlikely geometries."""
 
 
@@ -63,7 +63,7 @@ class Explanation:
 
     findings: list[Finding]
     steps: Steps
-    motion: Motion | None
+    motion: EgoMotion | None
     on_map: MapAnswer | None
 
     def numbers(self) -> dict[str, Any]:
@@ -109,13 +109,13 @@ def explain(log: RawLog, grid: OccupancyGrid | None = None, steps: Steps | None 
     return Explanation(ordered(found), steps, motion, on_map)
 
 
-def search_map(log: RawLog, grid: OccupancyGrid, steps: Steps, motion: Motion) -> MapAnswer | None:
+def search_map(log: RawLog, grid: OccupancyGrid, steps: Steps, motion: EgoMotion) -> MapAnswer | None:
     """The geometry under which most pieces of the drive lie on the map; None without a piece."""
     pieces = pieces_of(log, steps, motion)
     if not pieces:
         return None
     field, every = MapField(grid), max(1, log.ranges.shape[1] // 180)
-    scans = Scans(log.ranges[:, ::every], bearings(log.lidar)[::every])
+    scans = Thinned(log.ranges[:, ::every], bearings(log.lidar)[::every])
     tried: dict[Geometry, list[Place]] = {}
     for hypotheses, some in plans(pieces):
         for geometry in hypotheses:
@@ -133,7 +133,7 @@ def search_map(log: RawLog, grid: OccupancyGrid, steps: Steps, motion: Motion) -
 
 def plans(pieces: list[Piece]) -> list[tuple[list[Geometry], list[Piece]]]:
     """Geometries to try in turn, and on which pieces: as it is, mirrored, scaled, scaled by far."""
-    few = pieces[:: max(1, len(pieces) // PIECES)][:PIECES]
+    few = pieces[:: max(1, len(pieces) // _PIECES)][:_PIECES]
     scaled = [[Geometry(m, s) for s in scales for m in (False, True)] for scales in (SCALES, FAR_SCALES)]
     return [([Geometry(False), Geometry(True)], pieces), (scaled[0], few), (scaled[1], few)]
 
@@ -144,7 +144,7 @@ def held(places: list[Place]) -> float:
 
 
 def refined(
-    field: MapField, scans: Scans, geometry: Geometry, places: list[Place], tried: list[tuple[Geometry, float, float]]
+    field: MapField, scans: Thinned, geometry: Geometry, places: list[Place], tried: list[tuple[Geometry, float, float]]
 ) -> MapAnswer:
     """The answer for the best geometry, its numbers refined on the pieces that hold."""
     good = [p for p in places if p.score > HOLDS] or sorted(places, key=lambda p: -p.score)[:2]
@@ -154,7 +154,7 @@ def refined(
     for p in good:
         poses = fit.poses[start : start + len(p.poses)]
         start += len(p.poses)
-        settled.append(Place(p.piece, poses, map_fit.compare(field, seen, p.piece.scans, poses)))
+        settled.append(Place(p.piece, poses, map_fit.fit_of(field, seen, p.piece.scans, poses)))
     share = len([p for p in settled if p.score > HOLDS]) / len(places)
     later = [p.fit.agree[p.piece.searched :].mean() for p in settled]
     past = [p.fit.through[p.piece.searched :].mean() for p in settled]
@@ -163,7 +163,7 @@ def refined(
                      float(np.median(later)), float(np.median(past)), tried, kept)  # fmt: skip
 
 
-def of_odometry(log: RawLog, steps: Steps, motion: Motion) -> list[Finding]:
+def of_odometry(log: RawLog, steps: Steps, motion: EgoMotion) -> list[Finding]:
     """Findings on the odometry alone: standing still, leaping, its clock."""
     found = []
     if motion.frozen > 0.1:
@@ -202,7 +202,7 @@ def judged_leaps(log: RawLog) -> list[tuple[int, float, float]]:
     return found
 
 
-def of_geometry(log: RawLog, grid: OccupancyGrid | None, motion: Motion, on_map: MapAnswer | None) -> list[Finding]:
+def of_geometry(log: RawLog, grid: OccupancyGrid | None, motion: EgoMotion, on_map: MapAnswer | None) -> list[Finding]:
     """Findings on how the lidar sits, on scales and on signs."""
     placed = on_map is not None and bool(on_map.places)
     geometry = on_map.geometry if on_map is not None and placed else None
@@ -221,7 +221,7 @@ def of_geometry(log: RawLog, grid: OccupancyGrid | None, motion: Motion, on_map:
     return found + scales(log, grid, motion, on_map if placed else None)
 
 
-def handedness(log: RawLog, motion: Motion, geometry: Geometry | None) -> list[Finding]:
+def handedness(log: RawLog, motion: EgoMotion, geometry: Geometry | None) -> list[Finding]:
     """Which of scans, odometry and map is the mirror image, if one is."""
     known = np.isfinite(motion.agreement) and motion.agreement > 0.4
     against = known and motion.variant == "mirrored"
@@ -255,7 +255,7 @@ def handedness(log: RawLog, motion: Motion, geometry: Geometry | None) -> list[F
     ]
 
 
-def yaw(log: RawLog, motion: Motion, mirrored: bool, slack: float) -> list[Finding]:
+def yaw(log: RawLog, motion: EgoMotion, mirrored: bool, slack: float) -> list[Finding]:
     """A lidar that is turned on the base otherwise than the log says."""
     seen = -motion.yaw if mirrored else motion.yaw
     off = float(se2.wrap(np.asarray(seen - log.lidar.mount[2])))
@@ -270,7 +270,7 @@ def yaw(log: RawLog, motion: Motion, mirrored: bool, slack: float) -> list[Findi
     )]  # fmt: skip
 
 
-def scales(log: RawLog, grid: OccupancyGrid | None, motion: Motion, on_map: MapAnswer | None) -> list[Finding]:
+def scales(log: RawLog, grid: OccupancyGrid | None, motion: EgoMotion, on_map: MapAnswer | None) -> list[Finding]:
     """Ranges, map or odometry that are too long or too short."""
     known = np.isfinite(motion.agreement) and motion.agreement > 0.4
     way = motion.distance_scale if known else np.nan
@@ -317,7 +317,7 @@ def of_map(on_map: MapAnswer) -> list[Finding]:
     )]  # fmt: skip
 
 
-def of_reference(log: RawLog, grid: OccupancyGrid, motion: Motion, on_map: MapAnswer) -> list[Finding]:
+def of_reference(log: RawLog, grid: OccupancyGrid, motion: EgoMotion, on_map: MapAnswer) -> list[Finding]:
     """A reference that follows the robot and is shifted or turned against the map."""
     if log.reference is None or not on_map.places or abs(np.log(on_map.geometry.scale)) > 0.02:
         return []

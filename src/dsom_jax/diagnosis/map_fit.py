@@ -18,7 +18,7 @@ from dsom_jax.data import se2
 from dsom_jax.diagnosis.matching import thinned, transform
 from dsom_jax.occupancy import OccupancyGrid
 
-REACH = 15.0
+_REACH = 15.0
 """Metres of each reading's beam that are looked at."""
 NEAR = 0.3
 """A reading within so many metres of what the map predicts agrees; half a metre beyond, it goes through a wall."""
@@ -39,7 +39,7 @@ class Piece(NamedTuple):
     searched: int
 
 
-class Fit(NamedTuple):
+class MapFit(NamedTuple):
     """How scans at known poses agree with the map.
 
     Attributes:
@@ -65,7 +65,7 @@ class Place(NamedTuple):
 
     piece: Piece
     poses: np.ndarray
-    fit: Fit
+    fit: MapFit
 
     @property
     def score(self) -> float:
@@ -120,19 +120,19 @@ class MapField:
         return np.where(hit, travelled, np.inf)
 
 
-class Scans(NamedTuple):
+class Thinned(NamedTuple):
     """Readings (n, b) and their bearings (b,) in the frame of the sensor, thinned to a number of beams."""
 
     ranges: np.ndarray
     angles: np.ndarray
 
-    def under(self, geometry: Geometry) -> Scans:
+    def under(self, geometry: Geometry) -> Thinned:
         """The same scans if the geometry is what was assumed wrongly."""
         middle = (self.angles[0] + self.angles[-1]) / 2
         angles = middle + geometry.spread * (self.angles - middle)
-        return Scans(self.ranges * np.float32(geometry.scale), -angles if geometry.mirrored else angles)
+        return Thinned(self.ranges * np.float32(geometry.scale), -angles if geometry.mirrored else angles)
 
-    def points(self, n: int, reach: float = REACH) -> np.ndarray:
+    def points(self, n: int, reach: float = _REACH) -> np.ndarray:
         """Returns (k, 2) of scan n in the frame of the sensor."""
         used = np.isfinite(self.ranges[n]) & (self.ranges[n] < reach)
         return self.ranges[n, used, None] * np.column_stack([np.cos(self.angles[used]), np.sin(self.angles[used])])
@@ -144,14 +144,14 @@ def under(piece: Piece, geometry: Geometry) -> Piece:
     return piece._replace(poses=piece.poses * signs * [geometry.scale, geometry.scale, 1])
 
 
-def submap(piece: Piece, scans: Scans) -> tuple[np.ndarray, np.ndarray]:
+def submap(piece: Piece, scans: Thinned) -> tuple[np.ndarray, np.ndarray]:
     """Hits and swept free space of the searched part, each place once: (h, 2), (f, 2) in the frame of the piece."""
     hits, swept = [], []
     for n, pose in zip(piece.scans[: piece.searched], piece.poses, strict=False):
         points = scans.points(n)
         hits.append(transform(pose, points))
         length = np.hypot(*points.T)
-        for depth in np.arange(0.5, REACH, 0.5):
+        for depth in np.arange(0.5, _REACH, 0.5):
             beyond = length > depth + 0.4
             swept.append(transform(pose, points[beyond] * (depth / length[beyond])[:, None]))
     return thinned(np.concatenate(hits), 0.2), thinned(np.concatenate(swept), 0.4)
@@ -205,7 +205,7 @@ def settle(field: MapField, points: np.ndarray, pose: np.ndarray, gates: tuple[f
     return np.array([pose[0], pose[1], se2.wrap(pose[2])])
 
 
-def follow(field: MapField, piece: Piece, scans: Scans, start: np.ndarray) -> Place:
+def _follow(field: MapField, piece: Piece, scans: Thinned, start: np.ndarray) -> Place:
     """The piece from the pose ``start`` (3,) of its first scan: each scan settles on the map, the next one goes on."""
     poses = np.empty_like(piece.poses)
     for k in range(len(poses)):
@@ -214,32 +214,32 @@ def follow(field: MapField, piece: Piece, scans: Scans, start: np.ndarray) -> Pl
         else:
             guess = se2.compose(poses[k - 1], se2.relative(piece.poses[k - 1], piece.poses[k]))
         poses[k] = settle(field, scans.points(piece.scans[k]), guess, (0.5, 0.5, 0.4, 0.3, 0.3))
-    return Place(piece, poses, compare(field, scans, piece.scans, poses))
+    return Place(piece, poses, fit_of(field, scans, piece.scans, poses))
 
 
-def compare(field: MapField, scans: Scans, numbers: np.ndarray, poses: np.ndarray) -> Fit:
+def fit_of(field: MapField, scans: Thinned, numbers: np.ndarray, poses: np.ndarray) -> MapFit:
     """Scans ``numbers`` (n,) at sensor poses (n, 3) against ranges cast in the map."""
     every = max(1, len(scans.angles) // 60)
     headings = poses[:, 2, None] + scans.angles[None, ::every]
     origins = np.repeat(poses[:, :2], headings.shape[1], axis=0)
-    expected = field.cast(origins, headings.ravel(), REACH).reshape(headings.shape)
+    expected = field.cast(origins, headings.ravel(), _REACH).reshape(headings.shape)
     seen = scans.ranges[numbers][:, ::every]
-    seen = np.where(seen > REACH, np.inf, seen)
+    seen = np.where(seen > _REACH, np.inf, seen)
     returned, known = np.isfinite(seen), ~np.isnan(seen) & ~np.isneginf(seen)
     with np.errstate(invalid="ignore"):
         agree = returned & (np.abs(seen - expected) < NEAR)
         through = known & np.isfinite(expected) & (seen > expected + 0.5)
-    return Fit(agree.sum(1) / np.maximum(returned.sum(1), 1), through.sum(1) / np.maximum(known.sum(1), 1))
+    return MapFit(agree.sum(1) / np.maximum(returned.sum(1), 1), through.sum(1) / np.maximum(known.sum(1), 1))
 
 
-def place(field: MapField, piece: Piece, scans: Scans, geometry: Geometry, count: int = 4) -> Place:
+def place(field: MapField, piece: Piece, scans: Thinned, geometry: Geometry, count: int = 4) -> Place:
     """The best place of a piece under a geometry: the two of ``count`` on which its hits lie best are followed."""
     turned, seen = under(piece, geometry), scans.under(geometry)
     hits, swept = submap(turned, seen)
     gates = (1.0, 1.0, 0.8, 0.8, 0.5, 0.5, 0.5, 0.3, 0.3)
     starts = [settle(field, hits, start, gates) for start in search(field, hits, swept, count)]
     starts.sort(key=lambda start: float(np.minimum(field.at(transform(start, hits))[0], 0.5).mean()))
-    return max((follow(field, turned, seen, start) for start in starts[:2]), key=lambda p: p.score)
+    return max((_follow(field, turned, seen, start) for start in starts[:2]), key=lambda p: p.score)
 
 
 class Refined(NamedTuple):
@@ -251,7 +251,7 @@ class Refined(NamedTuple):
     poses: np.ndarray
 
 
-def refine(field: MapField, scans: Scans, numbers: np.ndarray, poses: np.ndarray, geometry: Geometry) -> Refined:
+def refine(field: MapField, scans: Thinned, numbers: np.ndarray, poses: np.ndarray, geometry: Geometry) -> Refined:
     """Gauss-Newton over the poses of all scans and, common to them, range scale and spread (Schur complement)."""
     scale, spread, poses = geometry.scale, geometry.spread, poses.copy()
     covariance = np.eye(2)
@@ -274,10 +274,10 @@ def refine(field: MapField, scans: Scans, numbers: np.ndarray, poses: np.ndarray
     return Refined(Geometry(geometry.mirrored, float(scale), float(spread)), float(sd[0]), float(sd[1]), poses)
 
 
-def _blocks(field: MapField, scans: Scans, n: int, pose: np.ndarray, gate: float, scale: float, spread: float
+def _blocks(field: MapField, scans: Thinned, n: int, pose: np.ndarray, gate: float, scale: float, spread: float
              ) -> tuple[np.ndarray, ...]:  # fmt: skip
     """Normal equations of one scan: pose-pose, pose-common, common-common, and the two right-hand sides."""
-    used = np.isfinite(scans.ranges[n]) & (scans.ranges[n] < REACH)
+    used = np.isfinite(scans.ranges[n]) & (scans.ranges[n] < _REACH)
     reach, angle = scans.ranges[n, used].astype(float), scans.angles[used] + pose[2]
     arm = reach[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
     distance, slope = field.at(pose[:2] + arm)

@@ -15,14 +15,14 @@ from scipy.spatial import cKDTree
 from dsom_jax.data import se2
 from dsom_jax.lidar import LidarConfig
 
-REACH = 20.0
+_REACH = 20.0
 """Metres; longer readings say little about a step of a metre and cost room in the picture."""
 TURN, SHIFT = 0.95, 1.6
 """The coarse search looks this far: radians, metres."""
 CELL = 0.1
 NEIGHBOURS = 7
 """Points through which the line at a point is laid."""
-CLOSE = 0.12
+_CLOSE = 0.12
 """Metres within which a matched point lies on the other scan."""
 
 
@@ -32,7 +32,7 @@ class Match(NamedTuple):
     Attributes:
         move: (3,) pose of the second sensor in the frame of the first (m, m, rad).
         information: (3, 3) inverse covariance of ``move`` up to one common factor; singular along a bare corridor.
-        share: of the points of the second scan in view of the first, those within ``CLOSE`` of it.
+        share: of the points of the second scan in view of the first, those within ``_CLOSE`` of it.
     """
 
     move: np.ndarray
@@ -45,7 +45,7 @@ def bearings(lidar: LidarConfig) -> np.ndarray:
     return lidar.angles().astype(float) - lidar.mount[2]
 
 
-def points_of(scan: np.ndarray, angles: np.ndarray, cell: float, reach: float = REACH) -> np.ndarray:
+def points_of(scan: np.ndarray, angles: np.ndarray, cell: float, reach: float = _REACH) -> np.ndarray:
     """(n, 2) returns of a scan (B,), one for each ``cell`` metres of wall."""
     used = np.isfinite(scan) & (scan < reach)
     points = scan[used, None] * np.column_stack([np.cos(angles[used]), np.sin(angles[used])])
@@ -76,7 +76,7 @@ class Reference:
 
     def picture(self) -> tuple[np.ndarray, int]:
         """uint8 (S, S) nearness to the scan, 255 on it, and the cell of the sensor."""
-        half = int((REACH + 2 * SHIFT) / CELL) + 2
+        half = int((_REACH + 2 * SHIFT) / CELL) + 2
         blank = np.full((2 * half + 1, 2 * half + 1), 255, np.uint8)
         cells = np.floor(self.points / CELL + 0.5).astype(int) + half
         blank[cells[:, 1], cells[:, 0]] = 0
@@ -103,8 +103,8 @@ def match(reference: Reference, points: np.ndarray) -> Match | None:
     if len(points) < 20 or len(reference.points) < 20:
         return None
     first, second = coarse(reference, points)
-    found = refine(reference, points, first)
-    return found if found.share > 0.75 else max(found, refine(reference, points, second), key=lambda m: m.share)
+    found = _refine(reference, points, first)
+    return found if found.share > 0.75 else max(found, _refine(reference, points, second), key=lambda m: m.share)
 
 
 def coarse(reference: Reference, points: np.ndarray) -> list[np.ndarray]:
@@ -129,7 +129,7 @@ def coarse(reference: Reference, points: np.ndarray) -> list[np.ndarray]:
     return poses
 
 
-def refine(reference: Reference, points: np.ndarray, start: np.ndarray, gates: tuple[float, ...] = (0.5, 0.3, 0.2)
+def _refine(reference: Reference, points: np.ndarray, start: np.ndarray, gates: tuple[float, ...] = (0.5, 0.3, 0.2)
            ) -> Match:  # fmt: skip
     """Point-to-line ICP from ``start`` (3,), with ever closer partners."""
     pose, information = start.copy(), np.zeros((3, 3))
@@ -151,5 +151,5 @@ def refine(reference: Reference, points: np.ndarray, start: np.ndarray, gates: t
     pose[2] = se2.wrap(pose[2])
     placed = transform(pose, points)
     seen = reference.sees(placed)
-    close = reference.tree.query(placed, distance_upper_bound=CLOSE)[0] < np.inf
+    close = reference.tree.query(placed, distance_upper_bound=_CLOSE)[0] < np.inf
     return Match(pose, information, float((close & seen).sum() / max(seen.sum(), 20)))

@@ -23,7 +23,7 @@ CHANGED = 0.2
 
 def cheap_findings(log: RawLog, grid: OccupancyGrid | None = None) -> list[Finding]:
     """Everything that needs no search. Give the log before ranges are cut by ``--laser-max-range``."""
-    found = [*no_return_code(log), *self_hits(log), *beams_vary(log), *odd_stamps(log), *frozen(log), *leaps(log)]
+    found = [*no_return_code(log), *self_hits(log), *beams_vary(log), *odd_stamps(log), *frozen(log), *_leaps(log)]
     if grid is not None:
         found += [*unknown_is_free(grid), *reference_off_map(log, grid)]
     return ordered(found)
@@ -169,7 +169,7 @@ def suspects(log: RawLog) -> np.ndarray:
     return np.sort(worst[odd[worst] > 1])
 
 
-def leaps(log: RawLog) -> list[Finding]:
+def _leaps(log: RawLog) -> list[Finding]:
     """Odometry that leaps from one scan to the next while the view stays, or faster than robots drive."""
     steps = []
     for i in suspects(log):

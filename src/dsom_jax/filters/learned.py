@@ -100,6 +100,6 @@ def bind(kind: Any, model: Any, grid: OccupancyGrid, lidar: LidarConfig, particl
     return kind(nnx.as_pure(weights), place, free_space(grid), prior, graph, lidar.every(step), step, particles)
 
 
-def even(n: int) -> Array:
+def even_log_weights(n: int) -> Array:
     """(n,) log weights of particles that are all the same."""
     return jnp.full((n,), -jnp.log(n), jnp.float32)

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import jax
 
-from dsom_jax.filters.learned import Learned, Prior, bind, even
+from dsom_jax.filters.learned import Learned, Prior, bind, even_log_weights
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.resampling import soft_resample
@@ -37,7 +37,7 @@ class PFNetFilter(Learned):
 
     def start(self, poses: Array) -> PFNetState:
         """Particles at given poses (N, 3)."""
-        return PFNetState(poses, even(poses.shape[0]))
+        return PFNetState(poses, even_log_weights(poses.shape[0]))
 
     def advance(self, key: Key, state: PFNetState, inputs: Inputs, prepared: Any) -> PFNetState:
         """One update; differentiable."""

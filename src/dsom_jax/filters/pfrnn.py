@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from dsom_jax.filters.learned import Learned, Prior, bind, even
+from dsom_jax.filters.learned import Learned, Prior, bind, even_log_weights
 from dsom_jax.geometry import compose
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.occupancy import OccupancyGrid
@@ -42,7 +42,7 @@ class PFRNNFilter(Learned):
     def start(self, poses: Array) -> PFRNNState:
         """Latent particles at given poses (N, 3)."""
         n = poses.shape[0]
-        return PFRNNState(poses, jnp.zeros((n, self.network().config.hidden)), even(n))
+        return PFRNNState(poses, jnp.zeros((n, self.network().config.hidden)), even_log_weights(n))
 
     def advance(self, key: Key, state: PFRNNState, inputs: Inputs, prepared: Any) -> PFRNNState:
         """One update; differentiable."""

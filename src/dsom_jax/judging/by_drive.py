@@ -10,7 +10,7 @@ import numpy as np
 
 from dsom_jax.episode import Episode
 from dsom_jax.judging.metrics import ANGLE, POSITION, Runs, pool, pose_error, ratio
-from dsom_jax.judging.scores import Replies, judge
+from dsom_jax.judging.scores import Replies, judge_drive
 
 
 class Worst(NamedTuple):
@@ -55,7 +55,7 @@ def worst_run(poses: Any, e_pos: Any, e_theta: Any) -> Worst:
 
 def judge_drives(episodes: Sequence[Episode], given: Sequence[Replies]) -> Judged:
     """Another localizer, by what it answered over each drive."""
-    judged = [judge(said, episode, n) for n, (episode, said) in enumerate(zip(episodes, given, strict=True))]
+    judged = [judge_drive(said, episode, n) for n, (episode, said) in enumerate(zip(episodes, given, strict=True))]
     runs = {phase: pool([part for j in judged for part in j[phase]]) for phase in ("global", "kidnap")}
     pairs = zip(episodes, given, strict=True)
     return Judged(

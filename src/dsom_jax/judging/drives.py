@@ -30,17 +30,17 @@ def cut(
     With ``kidnap`` each is followed by the one half the log further.
     """
     rows = segment_indices(log, segments, steps_per_segment, update_min_d, update_min_a)
-    check_length(log, rows.shape[1])
+    _check_length(log, rows.shape[1])
     pieces = [Drive(to_episode(log, row), log.stamps[row]) for row in without_repeats(rows)]
     if not kidnap:
         return pieces
     if len(pieces) < 2:
         raise UserError(f"{log.path}: --kidnap joins two segments; give a longer log or a smaller --steps-per-segment")
     others = pieces[len(pieces) // 2 :] + pieces[: len(pieces) // 2]
-    return [joined(first, then) for first, then in zip(pieces, others, strict=True)]
+    return [_joined(first, then) for first, then in zip(pieces, others, strict=True)]
 
 
-def check_length(log: RawLog, updates: int) -> None:
+def _check_length(log: RawLog, updates: int) -> None:
     """UserError for segments of so few updates that nothing can converge in them."""
     if updates > metrics.HOLD:
         return
@@ -52,7 +52,7 @@ def check_length(log: RawLog, updates: int) -> None:
     )
 
 
-def joined(first: Drive, then: Drive) -> Drive:
+def _joined(first: Drive, then: Drive) -> Drive:
     """The robot drives ``first`` and is carried, without noticing, to the start of ``then``."""
     return Drive(splice(first.episode, then.episode), np.concatenate([first.stamps, then.stamps]))
 

@@ -30,7 +30,7 @@ PEAK = 2.0, math.radians(30)
 """Two peaks are further apart than this."""
 MAX_PEAKS = 8
 PEAK_SHARE = 0.1
-FLOOR = 1e-30
+_FLOOR = 1e-30
 
 
 class Quality(NamedTuple):
@@ -76,7 +76,7 @@ def divergence(share: Array, free: Array, grid: pg.PoseGrid, pose: Array) -> Arr
     """Eq 5 for probabilities ``share`` (H, W, K)."""
     local = grid.frame().to_grid(pose)
     truth = dense(make_target(local, (grid.height, grid.width), grid.headings, grid.resolution), free)
-    return (jax.scipy.special.xlogy(truth, truth) - truth * jnp.log(jnp.maximum(share, FLOOR))).sum()
+    return (jax.scipy.special.xlogy(truth, truth) - truth * jnp.log(jnp.maximum(share, _FLOOR))).sum()
 
 
 def peaks(pm: pg.ProbabilityMap) -> Array:
@@ -96,7 +96,7 @@ def _pose(grid: pg.PoseGrid, flat: Array) -> Array:
     return pg.cell_pose(grid, *jnp.unravel_index(flat, grid.shape))
 
 
-def even(grid: OccupancyGrid, headings: int = 32) -> pg.ProbabilityMap:
+def _even(grid: OccupancyGrid, headings: int = 32) -> pg.ProbabilityMap:
     """PM of knowing nothing: uniform over free space."""
     return pg.from_log(pg.over(grid, headings), jnp.zeros((*grid.shape, headings)), grid.free)
 
@@ -126,7 +126,7 @@ def _of_scans(proposal: Proposal, grid: OccupancyGrid, ranges: Array, poses: Arr
     def one(scan: tuple[Array, Array]) -> Quality:
         pm = _prepare(proposal, scan[0])
         if pm is None:
-            return quality(even(grid), grid.free, scan[1])
+            return quality(_even(grid), grid.free, scan[1])
         return quality(pm, getattr(proposal, "free", grid.free), scan[1])
 
     return jax.lax.map(one, (ranges, poses))

@@ -13,7 +13,7 @@ from dsom_jax.occupancy import OccupancyGrid
 
 DOOR = 1.2
 """Metres: a passage narrower than this parts two rooms."""
-REACH = 0.5
+_REACH = 0.5
 """Metres about a room within which a pose still counts as in it: into a doorpost, a wall, a thing that is not there."""
 
 
@@ -45,7 +45,7 @@ def rooms_of(grid: OccupancyGrid, door: float = DOOR) -> Rooms:
     flooded = ndimage.watershed_ift(depth.astype(np.uint16), seeds.astype(np.int32))
     labels = np.where(free, flooded, 0)
     away, nearest = ndimage.distance_transform_edt(labels == 0, return_indices=True)
-    labels = np.where(away * grid.resolution <= REACH, labels[tuple(nearest)], 0) if labels.any() else labels
+    labels = np.where(away * grid.resolution <= _REACH, labels[tuple(nearest)], 0) if labels.any() else labels
     return Rooms(labels, grid, count + extra)
 
 

@@ -77,7 +77,7 @@ def judged_by(method: str) -> str:
     return "cluster" if "robust" in method else "mean"
 
 
-def judge(given: Replies, episode: Episode, drive: int = 0) -> dict[str, list[metrics.Runs]]:
+def judge_drive(given: Replies, episode: Episode, drive: int = 0) -> dict[str, list[metrics.Runs]]:
     """Metrics of each phase of one drive: ``global`` up to the first kidnapping, ``kidnap`` after every one."""
     truth, odometry = np.asarray(episode.poses), np.asarray(episode.odometry)
     certain = given.certain
@@ -100,7 +100,7 @@ def scores(
     """
     if all(np.isnan(drive.episode.poses).all() for drive in drives):
         return {"reference": None}
-    judged = [judge(a, d.episode, number) for number, (d, a) in enumerate(zip(drives, given, strict=True))]
+    judged = [judge_drive(a, d.episode, number) for number, (d, a) in enumerate(zip(drives, given, strict=True))]
     pooled = {phase: metrics.pool([runs for j in judged for runs in j[phase]]) for phase in ("global", "kidnap")}
     found = metrics.summarize(pooled["global"], seed)
     if any(j["kidnap"] for j in judged):
@@ -110,7 +110,7 @@ def scores(
     if trusted := [judge_trust(d, a) for d, a in zip(drives, given, strict=True) if a.p_lost is not None]:
         p_lost, wrong = (np.concatenate(column) for column in zip(*trusted, strict=True))
         found["p_lost"] = trust(p_lost, wrong)
-    return found | {"by_segment": [describe(d, j["global"][0], grid) for d, j in zip(drives, judged, strict=True)]}
+    return found | {"by_segment": [_describe(d, j["global"][0], grid) for d, j in zip(drives, judged, strict=True)]}
 
 
 def judge_trust(drive: Drive, given: Replies) -> tuple[np.ndarray, np.ndarray]:
@@ -130,7 +130,7 @@ def room_share(drives: Sequence[Drive], given: Sequence[Replies], rooms: Rooms, 
             "right_room_ci95": rate_interval(right, number, judged, seed)}  # fmt: skip
 
 
-def describe(drive: Drive, runs: metrics.Runs, grid: OccupancyGrid) -> dict[str, Any]:
+def _describe(drive: Drive, runs: metrics.Runs, grid: OccupancyGrid) -> dict[str, Any]:
     """One segment: where it starts in the log, how much of it lies on mapped free space, how often it succeeded."""
     poses = drive.episode.poses
     known = ~np.isnan(np.asarray(poses)).any(-1)

@@ -21,9 +21,9 @@ from dsom_jax.training.filter_loop import FilterTrainConfig, follow, graph_of, s
 from dsom_jax.training.sequences import Window, make_windows, plan_paths
 from dsom_jax.types import Array, Key
 
-START = 0.3, math.radians(10)
+_START = 0.3, math.radians(10)
 """Scatter of the particles at the start, metres and radians."""
-CLOSE = 0.5
+_CLOSE = 0.5
 """Metres within which a sequence counts as tracked to its end."""
 
 
@@ -31,7 +31,7 @@ def tracking_config(config: FilterTrainConfig, sequences: int) -> FilterTrainCon
     """Longer sequences from a known start, on other paths, with as much unknown as in the suite."""
     length = min(40, config.data.length)
     data = replace(config.data, drives=sequences, window=length, obstacles=8, removed=2, noise=0.03, dropout=0.0)
-    changes: dict[str, Any] = {"start_xy": (START[0],) * 2, "start_theta": (START[1],) * 2, "strays": 0.0}
+    changes: dict[str, Any] = {"start_xy": (_START[0],) * 2, "start_theta": (_START[1],) * 2, "strays": 0.0}
     return replace(config, data=replace(data, short=0.0), particles=100, **changes)
 
 
@@ -67,7 +67,7 @@ def tracked(error: Array) -> dict[str, float]:
     return {
         "sequences": len(distance),
         "updates": distance.shape[1],
-        "tracked": float((distance[:, -1] < CLOSE).mean()),
+        "tracked": float((distance[:, -1] < _CLOSE).mean()),
         "e_pos_m": float(np.median(distance[:, -1])),
         "e_theta_rad": float(np.median(turn[:, -1])),
     }

@@ -120,7 +120,7 @@ def channel_sum(x: Array) -> Array:
     return flat.sum(0)
 
 
-def moments(x: Array) -> tuple[Array, Array]:
+def _moments(x: Array) -> tuple[Array, Array]:
     """Mean and variance (C,) of x (..., C) over everything but the channels."""
     count = x.size // x.shape[-1]
     mean = channel_sum(x) / count
@@ -129,7 +129,7 @@ def moments(x: Array) -> tuple[Array, Array]:
 
 @jax.custom_vjp
 def _batch_norm_elu(x: Array, scale: Array, bias: Array) -> tuple[Array, Array, Array]:
-    mean, variance = moments(x)
+    mean, variance = _moments(x)
     return elu((x - mean) * (scale * jax.lax.rsqrt(variance + EPSILON)) + bias), mean, variance
 
 

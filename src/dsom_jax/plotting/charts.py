@@ -44,7 +44,7 @@ STYLES = {
 }
 """Name and colour of each method in figures."""
 STEP_COLORS = {"0-20": "#2a7f3f", "20-40": "#8cc56b", "40-60": "#f2c14e", ">60": "#ef8354", "never": "#8d99ae"}
-FLOOR = 1e-2
+_FLOOR = 1e-2
 """Metres below which an error is drawn as this on a logarithmic axis."""
 _FLIERS = {"marker": ".", "markersize": 2.5, "markerfacecolor": "0.3", "markeredgewidth": 0, "alpha": 0.4}
 _MEANS = {"marker": "D", "markersize": 4, "markerfacecolor": "white", "markeredgecolor": "black"}
@@ -53,7 +53,7 @@ _MEANS = {"marker": "D", "markersize": 4, "markerfacecolor": "white", "markeredg
 def error_boxes(
     errors: Mapping[str, Mapping[str, np.ndarray]],
     label: str = "final position error $E_{pos}$ [m]",
-    floor: float = FLOOR,
+    floor: float = _FLOOR,
 ) -> Figure:
     """Final errors of all runs, one panel per phase, one box per method: {phase: {method: (N,)}}.
 
@@ -183,7 +183,7 @@ def calibration_curves(curves: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> F
 def _band(ax: Axes, band: Band, color: str, label: str) -> None:
     """The mean and its band, where the reference is known."""
     time = np.flatnonzero(~np.isnan(band[0]))
-    mean, low, high = np.maximum(band[:, time], FLOOR)
+    mean, low, high = np.maximum(band[:, time], _FLOOR)
     ax.plot(time, mean, color=color, linewidth=1.4, label=label)
     ax.fill_between(time, low, high, color=color, alpha=0.2, linewidth=0)
 

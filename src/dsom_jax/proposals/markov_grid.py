@@ -107,7 +107,7 @@ class MarkovGrid:
         steps = (swing + odometry[:2], swing - odometry[:2])
         shifts = (jnp.stack(rotate(theta, *step)[::-1]) / grid.resolution for step in steps)
         full = jnp.zeros((self.likelihood.free.size + 1, grid.headings)).at[cells].set(belief)
-        forth, back = (shifted(full, cells, (grid.height, grid.width), s) for s in shifts)
+        forth, back = (_shifted(full, cells, (grid.height, grid.width), s) for s in shifts)
         moved = (1 - self.config.slip) * forth + self.config.slip / 2 * (back + belief)
         return jnp.where(self._real(), turned(moved, odometry[2] / grid.turn), 0.0)
 
@@ -128,7 +128,7 @@ def spline(offset: Array) -> tuple[Array, Array]:
     return whole.astype(jnp.int32), weights
 
 
-def shifted(full: Array, cells: Array, shape: tuple[int, int], shift: Array) -> Array:
+def _shifted(full: Array, cells: Array, shape: tuple[int, int], shift: Array) -> Array:
     """Belief (C, K) of ``cells`` (C,) after heading k moved by ``shift`` (2, K) cells along y and x.
 
     ``full`` (H * W + 1, K) is the belief before, its last row zero.

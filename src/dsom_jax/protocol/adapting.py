@@ -16,7 +16,7 @@ from dsom_jax import checkpoint
 from dsom_jax.atomic import write_atomic
 from dsom_jax.errors import UserError
 from dsom_jax.lidar import LidarConfig
-from dsom_jax.protocol.plan import Plan, merged
+from dsom_jax.protocol.plan import ProtocolPlan, merged
 
 
 def settings(start: Path, lidar: LidarConfig, changes: dict[str, Any]) -> dict[str, Any]:
@@ -60,7 +60,7 @@ class Site(NamedTuple):
     folder: Path
 
 
-def adapt(plan: Plan, site: Site, start: Path) -> Path:
+def adapt(plan: ProtocolPlan, site: Site, start: Path) -> Path:
     """Folder of the DSOM adapted to a map."""
     if not plan.adapt_minutes > 0:
         return start
@@ -68,7 +68,7 @@ def adapt(plan: Plan, site: Site, start: Path) -> Path:
     return train_on(("dsom_jax.train",), settings(start, site.lidar, plan.adapt), length, site, start, "")
 
 
-def adapt_filter(plan: Plan, site: Site, start: Path, kind: str) -> Path:
+def adapt_filter(plan: ProtocolPlan, site: Site, start: Path, kind: str) -> Path:
     """Folder of the PF-Net or PFRNN, as ``kind`` says, trained on in a map."""
     if not plan.learn_steps:
         return start

@@ -14,10 +14,10 @@ from dsom_jax.data.suite import Suite
 from dsom_jax.errors import UserError
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.occupancy import OccupancyGrid, is_free
-from dsom_jax.protocol.plan import Plan
+from dsom_jax.protocol.plan import ProtocolPlan
 
 
-def windows(log: RawLog, grid: OccupancyGrid, plan: Plan) -> Iterator[np.ndarray]:
+def windows(log: RawLog, grid: OccupancyGrid, plan: ProtocolPlan) -> Iterator[np.ndarray]:
     """Indices (T,) of pieces of a log that overlap by half, have a reference throughout, and lie on the map."""
     if log.reference is None:
         return
@@ -31,13 +31,13 @@ def windows(log: RawLog, grid: OccupancyGrid, plan: Plan) -> Iterator[np.ndarray
             yield used[piece]
 
 
-def rounded(lidar: LidarConfig) -> LidarConfig:
+def rounded_mount(lidar: LidarConfig) -> LidarConfig:
     """A lidar whose mount, which logs tell only through their poses, is rounded to a millimetre and a milliradian."""
     x, y, yaw = (round(value, 3) for value in lidar.mount)
     return replace(lidar, mount=(x, y, yaw))
 
 
-def choose(plan: Plan, logs: list[RawLog], name: str, grid: OccupancyGrid) -> Suite:
+def choose(plan: ProtocolPlan, logs: list[RawLog], name: str, grid: OccupancyGrid) -> Suite:
     """``plan.clips`` pieces of all logs, evenly spread, each joined to the next by a kidnapping."""
     found = [(log, rows) for log in logs for rows in windows(log, grid, plan)]
     if len(found) < plan.clips:
@@ -46,7 +46,7 @@ def choose(plan: Plan, logs: list[RawLog], name: str, grid: OccupancyGrid) -> Su
             f"{plan.clips} are wanted; check the pose of the map, the reference, updates and on_map"
         )
     chosen = [found[n] for n in np.linspace(0, len(found) - 1, plan.clips).round().astype(int)]
-    if len({rounded(log.lidar) for log, _ in chosen}) > 1:
+    if len({rounded_mount(log.lidar) for log, _ in chosen}) > 1:
         raise UserError(f"{name}: the logs are of different lidars; give one configuration for each")
     clips = [to_episode(log, rows) for log, rows in chosen]
     drives = [splice(clip, after) for clip, after in zip(clips, [*clips[1:], clips[0]], strict=True)]

@@ -14,13 +14,13 @@ from dsom_jax.filters.methods import network_of
 from dsom_jax.protocol.adapting import Site, adapt, adapt_filter
 from dsom_jax.protocol.clips import choose
 from dsom_jax.protocol.digests import map_digest
-from dsom_jax.protocol.plan import Plan, Variant, map_file, read_logs, read_plan, variants
+from dsom_jax.protocol.plan import ProtocolPlan, Variant, map_file, read_logs, read_plan, variants
 from dsom_jax.protocol.reporting import write_report
 from dsom_jax.protocol.running import Builder, identity, is_done, run_variant
 
 
 @dataclass(frozen=True)
-class Args:
+class ProtocolArgs:
     """Run one configuration."""
 
     config: Path
@@ -45,7 +45,7 @@ class Args:
     """Names of maps; default: all."""
 
 
-def main(args: Args) -> None:
+def main(args: ProtocolArgs) -> None:
     """All maps of a configuration."""
     changes = ("runs", "adapt_minutes", "adapt_steps", "learn_steps")
     plan = read_plan(args.config, {name: getattr(args, name) for name in changes})
@@ -64,7 +64,7 @@ def main(args: Args) -> None:
         write_report(plan, out)
 
 
-def start_network(plan: Plan, args: Args) -> Path | None:
+def start_network(plan: ProtocolPlan, args: ProtocolArgs) -> Path | None:
     """The network that training begins with, if any method draws from one."""
     start = args.checkpoint or checkpoint.shipped()
     needed = {kind for v in variants(plan) if (kind := network_of(v.method))}
@@ -75,7 +75,9 @@ def start_network(plan: Plan, args: Args) -> Path | None:
     return start
 
 
-def run_map(plan: Plan, suite: Suite, map_yaml: Path, start: Path | None, name: str, out: Path, work: Path) -> None:
+def run_map(
+    plan: ProtocolPlan, suite: Suite, map_yaml: Path, start: Path | None, name: str, out: Path, work: Path
+) -> None:
     """What is missing of the results of one map, in ``out``/NAME and ``work``/NAME."""
 
     site = Site(map_yaml, map_digest(suite.episodes[0][1]), suite.lidar, work / "networks" / name)

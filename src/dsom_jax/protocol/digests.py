@@ -16,7 +16,7 @@ DECIMALS = 3
 """Of metres and radians: another machine may round the last bits in another way."""
 
 
-def digest(*parts: Any) -> str:
+def _digest(*parts: Any) -> str:
     """Twelve hexadecimal digits of arrays, in this order; floats are rounded to a millimetre and a milliradian."""
     found = hashlib.sha256()
     for part in map(np.asarray, parts):
@@ -27,12 +27,12 @@ def digest(*parts: Any) -> str:
 
 def map_digest(grid: OccupancyGrid) -> str:
     """Of cells and frame: changes with the image or drawing and with every field that says how it is read."""
-    return digest(grid.occupied, grid.free, grid.origin, grid.resolution)
+    return _digest(grid.occupied, grid.free, grid.origin, grid.resolution)
 
 
 def clips_digest(suite: Suite) -> str:
     """Of all scans, poses and kidnappings: changes with the logs, their references and how clips are chosen."""
-    return digest(*(part for _, _, clip in suite.episodes for part in (clip.ranges, clip.poses, clip.kidnapped)))
+    return _digest(*(part for _, _, clip in suite.episodes for part in (clip.ranges, clip.poses, clip.kidnapped)))
 
 
 def digests(suite: Suite, networks: Mapping[str, Any]) -> dict[str, Any]:

@@ -20,13 +20,13 @@ from dsom_jax.errors import UserError
 from dsom_jax.filters.methods import METHODS, network_of
 from dsom_jax.training.options import override
 
-SHIPPED = "@shipped"
+_SHIPPED = "@shipped"
 """Behind the name of a method: its network as it is in the repository, not adapted to the map."""
-KINDS = ("scanned", "drawn")
+_KINDS = ("scanned", "drawn")
 
 
 @dataclass(frozen=True)
-class Plan:
+class ProtocolPlan:
     """A configuration file.
 
     Attributes:
@@ -74,7 +74,7 @@ class Plan:
     learn_steps: int = 0
     learn: dict[str, Any] = field(default_factory=dict)
 
-    def on(self, name: str) -> tuple[Plan, dict[str, Any]]:
+    def on(self, name: str) -> tuple[ProtocolPlan, dict[str, Any]]:
         """The plan of one map with what it replaces, and the fields that describe the map itself."""
         fields = dict(self.maps[name])
         own = {key: fields.pop(key) for key in ("logs", "map_kind") if key in fields}
@@ -100,7 +100,7 @@ class Variant:
     @property
     def name(self) -> str:
         """As it stands in the configuration."""
-        return self.method + SHIPPED * self.shipped
+        return self.method + _SHIPPED * self.shipped
 
     @property
     def stem(self) -> str:
@@ -108,29 +108,30 @@ class Variant:
         return self.name.replace("@", "-") + ("" if self.t_cut is None else f"-{self.t_cut:g}")
 
 
-def variants(plan: Plan) -> list[Variant]:
+def variants(plan: ProtocolPlan) -> list[Variant]:
     """All that is run on a map; T_cut is Alg 1's and nobody else's."""
     chosen = []
     for name in plan.methods:
-        method = name.removesuffix(SHIPPED)
+        method = name.removesuffix(_SHIPPED)
         cuts = plan.t_cuts if method.startswith("adam_") else (None,)
-        chosen += [Variant(method, name.endswith(SHIPPED), cut) for cut in cuts]
+        chosen += [Variant(method, name.endswith(_SHIPPED), cut) for cut in cuts]
     return chosen
 
 
-def read_plan(config: Path, changes: dict[str, Any]) -> Plan:
+def read_plan(config: Path, changes: dict[str, Any]) -> ProtocolPlan:
     """The configuration with what the command line changes (values that are not None)."""
-    plan: Plan = override(Plan(), read_yaml(config, "configuration"), str(config))
+    plan: ProtocolPlan = override(ProtocolPlan(), read_yaml(config, "configuration"), str(config))
     plan = replace(plan, **{name: value for name, value in changes.items() if value is not None})
-    unknown = [name for name in plan.methods if name.removesuffix(SHIPPED) not in METHODS]
-    unknown += [name for name in plan.methods if name.endswith(SHIPPED) and not network_of(name.removesuffix(SHIPPED))]
+    unknown = [name for name in plan.methods if name.removesuffix(_SHIPPED) not in METHODS]
+    shipped = [name for name in plan.methods if name.endswith(_SHIPPED)]
+    unknown += [name for name in shipped if not network_of(name.removesuffix(_SHIPPED))]
     unknown += [name for name in plan.shown if name not in plan.methods]
     if unknown or not (plan.maps and plan.methods and plan.t_cuts):
         raise UserError(f"{config}: needs maps, t_cuts, and known methods; got {unknown}")
     for name, fields in plan.maps.items():
         check_map(config, name, fields)
         one = plan.on(name)[0]
-        if not one.logs or one.map_kind not in KINDS:
+        if not one.logs or one.map_kind not in _KINDS:
             raise UserError(f"{config}: {name} needs logs, and map_kind scanned or drawn")
     if plan.clips < 2 or plan.updates < 6:
         raise UserError(f"{config}: give clips of at least 2 (a kidnapping joins two) and updates of at least 6")
@@ -189,7 +190,7 @@ def crop_of(drawing: Path, box: list[float], units: str) -> list[float]:
     return [float(x + left), float(y - bottom), float(x + right), float(y - top)]
 
 
-def read_logs(plan: Plan, data: Path) -> Iterator[RawLog]:
+def read_logs(plan: ProtocolPlan, data: Path) -> Iterator[RawLog]:
     """The logs, one after another, limited to the range that is used."""
     paths = sorted({path for pattern in plan.logs for path in data.glob(pattern) if path.suffix != ".tum"})
     if not paths:

@@ -11,10 +11,10 @@ from dsom_jax import plotting, report
 from dsom_jax.filters import methods
 from dsom_jax.judging.run_table import RunTable, join, paired
 from dsom_jax.judging.statistics import Evidence, paired_evidence
-from dsom_jax.protocol.plan import Plan, Variant, variants
+from dsom_jax.protocol.plan import ProtocolPlan, Variant, variants
 from dsom_jax.protocol.running import read_entry, read_evolution, read_table
 
-COLUMNS = (
+_COLUMNS = (
     "method",
     "network",
     "T_cut",
@@ -26,8 +26,8 @@ COLUMNS = (
     "strict %",
     "sure and wrong %",
 )
-PHASES = {"global": "Global localization", "kidnap": "Spliced kidnapping"}
-LEGEND = """\
+CLIP_PHASES = {"global": "Global localization", "kidnap": "Spliced kidnapping"}
+_LEGEND = """\
 Every clip starts without any prior on the pose; at its end the robot is carried to the start of the next one unnoticed.
 
 - converged: 5 updates in a row within 2 m and 10 deg; steps: updates before, median
@@ -44,21 +44,21 @@ Every clip starts without any prior on the pose; at its end the robot is carried
 """
 
 
-def write_report(plan: Plan, out: Path) -> None:
+def write_report(plan: ProtocolPlan, out: Path) -> None:
     """``out``/REPORT.md with everything that is there, and the figures of each map."""
-    parts = [f"# {plan.name}\n\nWritten by the experiment's command from its results; do not edit.\n\n{LEGEND}"]
+    parts = [f"# {plan.name}\n\nWritten by the experiment's command from its results; do not edit.\n\n{_LEGEND}"]
     for name in plan.maps:
         entries = load_entries(plan, out / name)
         if not entries:
             continue
         parts.append(f"\n## {name}\n\n{made_with(entries)}\n")
-        parts += [table(entries, phase) for phase in PHASES]
+        parts += [_table(entries, phase) for phase in CLIP_PHASES]
         parts.append(differences(plan, entries, out / name))
         figures(plan, out / name, entries)
     report.write_text(out / "REPORT.md", "\n".join(parts))
 
 
-def load_entries(plan: Plan, folder: Path) -> dict[Variant, dict[str, Any]]:
+def load_entries(plan: ProtocolPlan, folder: Path) -> dict[Variant, dict[str, Any]]:
     """The results of one map that exist, in the order of the plan."""
     found = {variant: read_entry(folder, variant) for variant in variants(plan)}
     return {variant: entry for variant, entry in found.items() if entry is not None}
@@ -74,12 +74,12 @@ def made_with(entries: dict[Variant, dict[str, Any]]) -> str:
     )
 
 
-def table(entries: dict[Variant, dict[str, Any]], phase: str) -> str:
+def _table(entries: dict[Variant, dict[str, Any]], phase: str) -> str:
     """Markdown table of one phase."""
-    rows = [COLUMNS, ("---", "---", *["---:"] * (len(COLUMNS) - 2))]
-    rows += [row(variant, network_of(entry), entry[phase]) for variant, entry in entries.items()]
+    rows = [_COLUMNS, ("---", "---", *["---:"] * (len(_COLUMNS) - 2))]
+    rows += [row(variant, _network_of(entry), entry[phase]) for variant, entry in entries.items()]
     lines = ["| " + " | ".join(cells) + " |" for cells in rows]
-    return f"**{PHASES[phase]}**\n\n" + "\n".join(lines) + "\n"
+    return f"**{CLIP_PHASES[phase]}**\n\n" + "\n".join(lines) + "\n"
 
 
 def row(variant: Variant, origin: str, m: dict[str, Any]) -> tuple[str, ...]:
@@ -87,12 +87,12 @@ def row(variant: Variant, origin: str, m: dict[str, Any]) -> tuple[str, ...]:
     return (
         f"`{variant.method}`", origin, "" if variant.t_cut is None else f"{variant.t_cut:g}",
         f"{m['experiments']}", rate(m, "converged"), number(m["steps_median"], "{:g}"),
-        number(m["e_pos_m"], "{:.3f}") + interval(m["e_pos_ci95"], "{:.3f}", 1),
+        number(m["e_pos_m"], "{:.3f}") + _interval(m["e_pos_ci95"], "{:.3f}", 1),
         rate(m, "retention"), number(m["strict_success"], "{:.1f}", 100), number(m["false_confident"], "{:.1f}", 100),
     )  # fmt: skip
 
 
-def network_of(entry: dict[str, Any]) -> str:
+def _network_of(entry: dict[str, Any]) -> str:
     """Where the network of a result comes from, for a cell."""
     facts = entry.get("network")
     if not facts:
@@ -104,7 +104,7 @@ def rate(m: dict[str, Any], name: str) -> str:
     """A share in percent with its interval."""
     if m[name] is None:
         return "-"
-    return number(m[name], "{:.1f}", 100) + interval(m[f"{name}_ci95"], "{:.1f}", 100)
+    return number(m[name], "{:.1f}", 100) + _interval(m[f"{name}_ci95"], "{:.1f}", 100)
 
 
 def number(value: float | None, form: str, scale: float = 1) -> str:
@@ -112,7 +112,7 @@ def number(value: float | None, form: str, scale: float = 1) -> str:
     return "-" if value is None else form.format(scale * value)
 
 
-def interval(bounds: list[float | None], form: str, scale: float) -> str:
+def _interval(bounds: list[float | None], form: str, scale: float) -> str:
     """Bounds in brackets, nothing where there are none."""
     low, high = bounds
     return "" if low is None or high is None else f" [{form.format(scale * low)}-{form.format(scale * high)}]"
@@ -154,7 +154,7 @@ def comparable(entries: dict[Variant, dict[str, Any]], variant: Variant, other: 
     return one_each and all(sides[0][key] == sides[1][key] for key in same)
 
 
-def differences(plan: Plan, entries: dict[Variant, dict[str, Any]], folder: Path) -> str:
+def differences(plan: ProtocolPlan, entries: dict[Variant, dict[str, Any]], folder: Path) -> str:
     """Paired comparisons in both phases: differences with intervals, and what they decide."""
     asked = list(pairs(entries))
     found = [(a, b) for a, b in asked if comparable(entries, a, b)]
@@ -163,7 +163,7 @@ def differences(plan: Plan, entries: dict[Variant, dict[str, Any]], folder: Path
     lines = ["| a against b | phase | what | a - b [95 % interval] | decided |", "| --- | --- | --- | ---: | --- |"]
     for a, b in found:
         both = join([read_table(folder, v) for v in (a, b)])
-        for phase in PHASES:
+        for phase in CLIP_PHASES:
             lines += [line(a, b, phase, piece) for piece in compare(both, a, b, phase, plan.seed)]
     note = (
         f"Paired: same clips, same seeds. Intervals draw clips, of which {plan.clips} are few; a difference counts as "
@@ -190,10 +190,10 @@ def line(a: Variant, b: Variant, phase: str, piece: Evidence) -> str:
     decided = {"supports": "a better", "contradicts": "b better", "undecided": "undecided"}[piece.status()]
     bounds = "" if math.isnan(piece.low) else f" [{piece.low:.3f}, {piece.high:.3f}]"
     names = f"`{a.stem}`, `{b.stem}`"
-    return f"| {names} | {PHASES[phase]} | {piece.what} | {piece.estimate:.3f}{bounds} | {decided} |"
+    return f"| {names} | {CLIP_PHASES[phase]} | {piece.what} | {piece.estimate:.3f}{bounds} | {decided} |"
 
 
-def figures(plan: Plan, out: Path, entries: dict[Variant, dict[str, Any]]) -> None:
+def figures(plan: ProtocolPlan, out: Path, entries: dict[Variant, dict[str, Any]]) -> None:
     """Error over the updates with its 95 % band, as in the paper's figures of real data; boxes of final errors."""
     shown = [v for v in entries if v.name in (plan.shown or plan.methods) and v.t_cut in (None, plan.t_cuts[0])]
     shown = [v for v in shown if comparable(entries, shown[0], v)]
@@ -204,5 +204,5 @@ def figures(plan: Plan, out: Path, entries: dict[Variant, dict[str, Any]]) -> No
     bands = [{name: curve[clip] for name, curve in curves.items()} for clip in clips]
     moved = [[entries[shown[0]]["updates"]]] * len(bands)
     plotting.save_figure(plotting.band_evolution(bands, moved), out / "error_evolution.png")
-    errors = {phase: {name: t.e_pos_m[t.phase == phase] for name, t in tables.items()} for phase in PHASES}
+    errors = {phase: {name: t.e_pos_m[t.phase == phase] for name, t in tables.items()} for phase in CLIP_PHASES}
     plotting.save_figure(plotting.error_boxes(errors), out / "position_error.png")

@@ -22,7 +22,7 @@ from dsom_jax.montecarlo import run_keys
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.proposals.dual_features import with_episode
 from dsom_jax.protocol.digests import clips_digest, map_digest
-from dsom_jax.protocol.plan import Plan, Variant
+from dsom_jax.protocol.plan import ProtocolPlan, Variant
 from dsom_jax.run_folder import commit
 from dsom_jax.types import Filter, Proposal
 
@@ -36,7 +36,7 @@ class Builder:
     Whatever weighs by Eq 15 is taken sharpened (``_sharp``); plans and results name it without that.
     """
 
-    def __init__(self, plan: Plan, suite: Suite, networks: Networks) -> None:
+    def __init__(self, plan: ProtocolPlan, suite: Suite, networks: Networks) -> None:
         self.plan, self.suite, self.networks = plan, suite, networks
         self.made: dict[Path | None, dict[str, Proposal]] = {}
         self.commit = commit()[:7]
@@ -61,14 +61,14 @@ class Builder:
 
 
 def run_variant(
-    variant: Variant, plan: Plan, suite: Suite, build: Builder, made_of: dict[str, Any], out: Path, work: Path
+    variant: Variant, plan: ProtocolPlan, suite: Suite, build: Builder, made_of: dict[str, Any], out: Path, work: Path
 ) -> None:
     """One method on all clips: OUT/STEM.json, with what it is ``made_of``, every run in STEM.npz, a picture in WORK."""
     keys = [run_keys(plan.seed, number, plan.runs) for number in range(len(suite.episodes))]
     record = bench.run_method(variant.method, suite, keys, lambda _, __, grid, episode: build(variant, grid, episode))
-    shared = bench.Settings(plan.runs, plan.particles, variant.t_cut or plan.t_cuts[0], plan.seed)
+    shared = bench.BenchSettings(plan.runs, plan.particles, variant.t_cut or plan.t_cuts[0], plan.seed)
     entry = bench.summary(suite, {variant.method: record}, shared)["methods"][variant.method]
-    draw(variant, suite, record, work)
+    _draw(variant, suite, record, work)
     facts = {"variant": variant.name, "t_cut": variant.t_cut, **made_of, "commit": build.commit}
     facts["network"] = network_facts(build.networks(variant), variant)
     write_runs(out / f"{variant.stem}.npz", record.table, evolution=plotting.bands_of(record.traces))
@@ -89,7 +89,7 @@ def network_facts(folder: Path | None, variant: Variant) -> dict[str, Any] | Non
     }
 
 
-def identity(variant: Variant, plan: Plan, suite: Suite, start: Path | None) -> dict[str, Any]:
+def identity(variant: Variant, plan: ProtocolPlan, suite: Suite, start: Path | None) -> dict[str, Any]:
     """What must be the same for a result to be kept; ``start`` is the network that it uses, or that was trained on."""
     return trained_on(variant, plan) | {
         "suite": suite.name, "map_kind": plan.map_kind, "runs": plan.runs, "particles": plan.particles,
@@ -99,7 +99,7 @@ def identity(variant: Variant, plan: Plan, suite: Suite, start: Path | None) -> 
     }  # fmt: skip
 
 
-def trained_on(variant: Variant, plan: Plan) -> dict[str, Any]:
+def trained_on(variant: Variant, plan: ProtocolPlan) -> dict[str, Any]:
     """How the network of a variant is trained on in the map; nothing if it has none, or uses it as it is shipped."""
     kind = network_of(variant.method)
     if kind is None or variant.shipped:
@@ -141,11 +141,11 @@ def read_entry(out: Path, variant: Variant) -> dict[str, Any] | None:
     return found
 
 
-def draw(variant: Variant, suite: Suite, record: bench.Record, work: Path) -> None:
+def _draw(variant: Variant, suite: Suite, record: bench.Record, work: Path) -> None:
     """Particles and PM of the first run of the first clip at four moments."""
     _, grid, episode = suite.episodes[0]
     estimates = getattr(record.result.info, judged_by(variant.method))[0]
     figure = plotting.moment_figure(
-        grid, suite.lidar, episode, record.filter, bench.moments(episode), record.result.kept.poses, estimates
+        grid, suite.lidar, episode, record.filter, bench.picture_updates(episode), record.result.kept.poses, estimates
     )
     plotting.save_figure(figure, work / f"{variant.stem}.png")

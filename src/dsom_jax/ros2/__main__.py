@@ -17,7 +17,7 @@ _ROS = "--ros-args"
 
 
 @dataclass(frozen=True)
-class Args:
+class NodeArgs:
     """Localize one robot: a ROS 2 node with the topics, services and parameters of nav2_amcl.
 
     Whatever follows --ros-args is ROS's own, such as -r __ns:=/robot or -p update_min_d:=0.1.
@@ -37,7 +37,7 @@ def main() -> None:
     """Command line."""
     own, of_ros = split(sys.argv[1:])
     sys.argv[1:] = own
-    args = parse(Args, "python -m dsom_jax.ros2")
+    args = parse(NodeArgs, "python -m dsom_jax.ros2")
     if args.params_file is not None:
         parameters.understood(parameters.read_file(args.params_file, args.name))
         of_ros = ["--params-file", str(args.params_file), *of_ros]

@@ -19,7 +19,7 @@ from dsom_jax.errors import UserError
 from dsom_jax.live import Localizer
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.ros2.exchange import Counts, Output, Told, Trusted, same
-from dsom_jax.ros2.messages import Scan, fitted, lidar_of
+from dsom_jax.ros2.messages import Scan, fitted, lidar_of_scan
 from dsom_jax.ros2.parameters import Parameters, settings_of
 from dsom_jax.ros2.transforms import Transforms
 
@@ -197,7 +197,7 @@ class Engine:
         if mount.tilt > _TILT:
             self._say("warn", f"the laser is tilted by {np.degrees(mount.tilt):.0f} deg: no horizontal cut")
         try:
-            lidar = lidar_of(scan, mount, self.parameters.laser_min_range, self.parameters.reach)
+            lidar = lidar_of_scan(scan, mount, self.parameters.laser_min_range, self.parameters.reach)
         except UserError as error:
             self._complain(str(error))
             return

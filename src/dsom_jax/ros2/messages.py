@@ -64,7 +64,7 @@ def scan_of(message: Any) -> Scan:
     )
 
 
-def lidar_of(scan: Scan, mount: Mount, least: float, most: float) -> LidarConfig:
+def lidar_of_scan(scan: Scan, mount: Mount, least: float, most: float) -> LidarConfig:
     """Geometry that the filter is compiled for, of the first scan.
 
     ``least`` and ``most`` are ``laser_min_range`` and ``laser_max_range`` of nav2: negative leaves the scan's own.

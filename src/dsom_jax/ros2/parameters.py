@@ -147,14 +147,14 @@ def understood(values: Mapping[str, Any]) -> tuple[Parameters, list[str]]:
     Raises:
         UserError: a value of the wrong kind or out of bounds.
     """
-    known = {NAMES[name]: checked(NAMES[name], value) for name, value in values.items() if name in NAMES}
+    known = {NAMES[name]: _checked(NAMES[name], value) for name, value in values.items() if name in NAMES}
     parameters = replace(Parameters(), **known)
     if parameters.map_kind not in ("scanned", "drawn"):
         raise UserError(f"parameter map_kind = {parameters.map_kind!r}: choose scanned or drawn")
     return parameters, [*_without_meaning(values), *_unknown(values), *_notes(parameters, values)]
 
 
-def checked(field: str, value: Any) -> Any:
+def _checked(field: str, value: Any) -> Any:
     """A value of the field's kind; whole numbers do for real ones, as in ROS's files."""
     kind = _KIND[field]
     name = field.replace("initial_pose_", "initial_pose.") if field in NAMES.values() else field
@@ -239,6 +239,6 @@ def changed(parameters: Parameters, name: str, value: Any) -> tuple[Parameters, 
     if field not in LIVE:
         return parameters, f"{name} is fixed when the filter is compiled; set it in the file and start the node again"
     try:
-        return replace(parameters, **{field: checked(field, value)}), ""
+        return replace(parameters, **{field: _checked(field, value)}), ""
     except UserError as error:
         return parameters, str(error)

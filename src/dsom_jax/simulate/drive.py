@@ -74,14 +74,14 @@ def make_synthetic(
 ) -> tuple[OccupancyGrid, Episode]:
     """The true world of a drive through the map ``grid``, and the episode; the same seed gives the same drive."""
     k_world, k_scan, k_odometry = jax.random.split(jax.random.key(seed), 3)
-    poses, before, kidnapped = plan(np.random.default_rng(seed), grid, config)
+    poses, before, kidnapped = _plan(np.random.default_rng(seed), grid, config)
     world = true_world(k_world, grid, poses, config)
-    ranges = sense(k_scan, world, poses, config)
-    odometry = measure(k_odometry, before, poses, config.odometry)
+    ranges = _sense(k_scan, world, poses, config)
+    odometry = measure_odometry(k_odometry, before, poses, config.odometry)
     return world, Episode(ranges, odometry, poses, kidnapped, stamps(before, poses))
 
 
-def plan(rng: np.random.Generator, grid: OccupancyGrid, config: DriveConfig) -> tuple[Array, Array, Array]:
+def _plan(rng: np.random.Generator, grid: OccupancyGrid, config: DriveConfig) -> tuple[Array, Array, Array]:
     """Poses (T, 3) of the updates, poses (T, 3) where the odometry's increments start, and kidnappings (T,).
 
     An increment starts at the previous update; after a kidnapping it starts where the robot was put down.
@@ -125,7 +125,7 @@ def true_world(key: Key, grid: OccupancyGrid, poses: Array, config: DriveConfig)
     return _add(k_add, world, config.obstacles, where=jnp.asarray(where), keep=jnp.asarray(keep))
 
 
-def sense(key: Key, world: OccupancyGrid, poses: Array, config: DriveConfig) -> Array:
+def _sense(key: Key, world: OccupancyGrid, poses: Array, config: DriveConfig) -> Array:
     """Noisy scans (T, B) of the true world."""
     return _scan(key, world, poses, config.lidar, config.lidar_noise)
 
@@ -137,7 +137,7 @@ def _scan(key: Key, world: OccupancyGrid, poses: Array, lidar: LidarConfig, nois
 
 
 @partial(jax.jit, static_argnames=("noise",))
-def measure(key: Key, before: Array, poses: Array, noise: OdometryMotion) -> Array:
+def measure_odometry(key: Key, before: Array, poses: Array, noise: OdometryMotion) -> Array:
     """Noisy increments (T, 3) between poses ``before`` and ``poses`` in the base frame; row 0 is zero."""
     increments = relative(before, poses)
     # After a kidnapping the increment is the drive since the robot was put down: nothing gives the carrying away.

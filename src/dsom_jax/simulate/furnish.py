@@ -9,7 +9,7 @@ from dsom_jax.simulate.floorplan import Style
 from dsom_jax.simulate.morphology import grow
 from dsom_jax.types import Array, Key
 
-TILES = 32
+_TILES = 32
 """Tiles repeat after this many along each axis; with tiles of a metre and more that is rooms away."""
 
 
@@ -17,7 +17,7 @@ def furnish(key: Key, style: Style, labels: Array, is_corridor: Array, wall: Arr
     """Cells (H, W) that furniture, pillars and shelves occupy; ``u``, ``v`` (H, W) metres in the building frame."""
     k_room, k_tile = jax.random.split(key)
     rooms = jax.random.uniform(k_room, (is_corridor.shape[0], 7))
-    small, large, shelves = jnp.split(jax.random.uniform(k_tile, (TILES * TILES, 16)), (7, 14), axis=1)
+    small, large, shelves = jnp.split(jax.random.uniform(k_tile, (_TILES * _TILES, 16)), (7, 14), axis=1)
     # Some rooms are full and some empty; corridors are nearly empty.
     density = style.furniture * jnp.where(is_corridor, 0.06, jnp.clip(2.2 * rooms[:, 0] - 0.5, 0.0, 1.0))
     items = _items(small, 1.1, (0.17, 0.35), (0.6 * density * rooms[:, 1])[labels], u, v)
@@ -29,7 +29,7 @@ def furnish(key: Key, style: Style, labels: Array, is_corridor: Array, wall: Arr
 def _tile(draws: Array, u: Array, v: Array, size: float) -> tuple[Array, Array, Array]:
     """Draws (n, ...) of the tile of ``size`` metres under each point, and the point's place from the tile's middle."""
     i, j = (jnp.floor(w / size).astype(jnp.int32) for w in (u, v))
-    mine = jnp.moveaxis(draws[(i % TILES) * TILES + j % TILES], -1, 0)
+    mine = jnp.moveaxis(draws[(i % _TILES) * _TILES + j % _TILES], -1, 0)
     return mine, u - (i + 0.5) * size, v - (j + 0.5) * size
 
 

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from dsom_jax.occupancy import OccupancyGrid
-from dsom_jax.resampling import resample
+from dsom_jax.resampling import draw_ancestors
 from dsom_jax.simulate.morphology import clear_of
 from dsom_jax.types import Array, Key
 
@@ -74,7 +74,7 @@ def _draw_shapes(key: Key, cells: Array, present: Array, sizes: tuple[float, flo
     if not len(present):
         return jnp.zeros(cells.shape, bool)
     k_cell, k_shape = jax.random.split(key)
-    flat = resample(k_cell, cells.ravel().astype(jnp.float32), len(present), "multinomial")
+    flat = draw_ancestors(k_cell, cells.ravel().astype(jnp.float32), len(present), "multinomial")
     i, j = flat // cells.shape[1], flat % cells.shape[1]
     reach = math.ceil(sizes[1] * math.sqrt(0.5)) + 1
     steps = jnp.arange(-reach, reach + 1)

@@ -64,7 +64,7 @@ class WorldConfig:
     def __post_init__(self) -> None:
         checks.count(self, "cells", 32)
         checks.within(self, "resolution", 0.05, 0.5, "give 0.05 to 0.5 metres per cell")
-        checks.interval(self, "room_size corridor_width door_width", 0.0)
+        checks.low_high(self, "room_size corridor_width door_width", 0.0)
         checks.share(self, "hall void merge slanted curved rotated symmetric notched thick furniture pillars shelves")
         levels = self.corridors
         if not (len(levels) == 4 and all(p >= 0 for p in levels) and abs(sum(levels) - 1) < 1e-6):

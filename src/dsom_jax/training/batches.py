@@ -20,7 +20,7 @@ from dsom_jax.simulate.obstacles import add_obstacles, remove_structure
 from dsom_jax.training.buildings import WorldSource, random_poses
 from dsom_jax.types import Array, Key
 
-PIECES = 24
+_PIECES = 24
 """Bearings of a full turn between which shifts of misplaced walls are interpolated."""
 
 
@@ -73,8 +73,8 @@ class ScanConfig:
         checks.within(self, "fov_min", 0, self.fov_max + 1e-6, f"must not exceed fov_max = {self.fov_max!r} rad")
         checks.not_negative(self, "sigma misplaced")
         checks.share(self, "limited dropout short deep bare")
-        checks.interval(self, "obstacles removed", 0)
-        checks.interval(self, "depth")
+        checks.low_high(self, "obstacles removed", 0)
+        checks.low_high(self, "depth")
 
     @property
     def lidar(self) -> LidarConfig:
@@ -82,13 +82,13 @@ class ScanConfig:
         return LidarConfig(self.beams, -math.pi, 2 * math.pi / self.beams, 0.0, self.range_max)
 
 
-def plain(config: ScanConfig) -> ScanConfig:
+def plain_scans(config: ScanConfig) -> ScanConfig:
     """Full scans with little noise; the map lacks only 20 obstacles per 43 m x 43 m."""
     quiet = replace(config, sigma=0.02, dropout=0.0, short=0.0, deep=0.0)
     return replace(quiet, limited=0.0, thinning=1, obstacles=(20, 20), bare=0.0, removed=(0, 0), misplaced=0.0)
 
 
-PLAIN = plain(ScanConfig())
+PLAIN = plain_scans(ScanConfig())
 """The scans that checkpoints are judged by: one full turn, 20 unknown obstacles per 43 m x 43 m."""
 
 
@@ -141,9 +141,9 @@ def random_depth(key: Key, config: ScanConfig) -> Array:
 
 def misplace(key: Key, ranges: Array, sigma: float) -> Array:
     """Ranges (B,) of a full turn to walls that stand elsewhere, by ``sigma`` metres that vary with the bearing."""
-    shifts = sigma * jax.random.normal(key, (PIECES,))
-    where = jnp.arange(ranges.size) * (PIECES / ranges.size)
-    return jnp.maximum(ranges + jnp.interp(where, jnp.arange(PIECES), shifts, period=PIECES), 0.0)
+    shifts = sigma * jax.random.normal(key, (_PIECES,))
+    where = jnp.arange(ranges.size) * (_PIECES / ranges.size)
+    return jnp.maximum(ranges + jnp.interp(where, jnp.arange(_PIECES), shifts, period=_PIECES), 0.0)
 
 
 def spoil_scan(key: Key, ranges: Array, config: ScanConfig) -> tuple[Array, Conditions]:

@@ -14,7 +14,7 @@ from dsom_jax.occupancy import OccupancyGrid, is_free, resample
 from dsom_jax.simulate.worlds import WorldConfig, make_world
 from dsom_jax.types import Array, Key
 
-T = TypeVar("T")
+_T = TypeVar("_T")
 
 
 class Building(NamedTuple):
@@ -57,7 +57,7 @@ def procedural_source(world: WorldConfig, bare: float) -> WorldSource:
         seen = make_world(k_world, world)
         if not bare:
             return Building(seen, seen)
-        return Building(choose(jax.random.uniform(k_bare) < bare, make_world(k_world, empty), seen), seen)
+        return Building(_choose(jax.random.uniform(k_bare) < bare, make_world(k_world, empty), seen), seen)
 
     return draw
 
@@ -67,12 +67,12 @@ def mixed_source(first: WorldSource, second: WorldSource, share: float) -> World
 
     def draw(key: Key) -> Building:
         k_which, k_first, k_second = jax.random.split(key, 3)
-        return choose(jax.random.uniform(k_which) < share, first(k_first), second(k_second))
+        return _choose(jax.random.uniform(k_which) < share, first(k_first), second(k_second))
 
     return draw
 
 
-def choose(condition: Array, first: T, second: T) -> T:
+def _choose(condition: Array, first: _T, second: _T) -> _T:
     """``first`` where ``condition`` () holds, else ``second``, leaf by leaf."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), first, second)
 
@@ -114,7 +114,7 @@ def crop_source(pool: MapPool, cells: int, resolution: float, fine: float | None
         x, y = random_poses(k_cell, free, 1.0, 1)[0, :2].astype(jnp.int32)
         corner = [jnp.clip(c - side // 2, 0, n - side) for c, n in zip((y, x), free.shape, strict=True)]
         turn = jax.random.randint(k_turn, (), 0, 8)
-        occupied, free = (turned(jax.lax.dynamic_slice(a, corner, (side, side)), turn) for a in (occupied, free))
+        occupied, free = (turned_square(jax.lax.dynamic_slice(a, corner, (side, side)), turn) for a in (occupied, free))
         grid = OccupancyGrid(occupied, free, jnp.zeros(3), own)
         return Building(grid, grid) if fine is None else with_fine(grid, resolution)
 
@@ -138,7 +138,7 @@ def centres(grid: OccupancyGrid) -> Array:
     return grid.from_grid(jnp.stack([x, y, jnp.zeros_like(x)], axis=-1))
 
 
-def turned(square: Array, turn: Array) -> Array:
+def turned_square(square: Array, turn: Array) -> Array:
     """One of the eight symmetries of a square array (n, n)."""
     square = jnp.where(turn & 1, square[::-1], square)
     square = jnp.where(turn & 2, square[:, ::-1], square)

@@ -68,7 +68,7 @@ class FilterTrainConfig:
 
     def __post_init__(self) -> None:
         checks.count(self, "batch particles")
-        checks.interval(self, "start_xy start_theta", 1e-3)
+        checks.low_high(self, "start_xy start_theta", 1e-3)
         checks.share(self, "strays ema", excluding=")")
         checks.not_negative(self, "heading_weight particle_weight")
         checks.positive(self, "particle_xy particle_theta learning_rate clip")
@@ -156,7 +156,7 @@ def window_losses(states: Any, window: Window, config: FilterTrainConfig) -> tup
     return prediction.mean(), particles.mean()
 
 
-def batch_losses(
+def _batch_losses(
     params: Any, graph: Any, config: FilterTrainConfig, places: CornerMap, key: Key, windows: Window
 ) -> FilterLosses:
     """Losses of a batch of sequences."""
@@ -180,7 +180,7 @@ def make_filter_step(config: FilterTrainConfig, places: CornerMap) -> Callable[.
     graph, root = graph_of(config), jax.random.key(config.seed + 2)
 
     def objective(params: Any, key: Key, windows: Window) -> tuple[Array, FilterLosses]:
-        losses = batch_losses(params, graph, config, places, key, windows)
+        losses = _batch_losses(params, graph, config, places, key, windows)
         return losses.total, losses
 
     def step(state: FilterTrainState, windows: Window, total: Array) -> tuple[FilterTrainState, dict[str, Array]]:

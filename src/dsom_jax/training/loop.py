@@ -142,7 +142,7 @@ def averaged_model(config: TrainConfig, state: TrainState) -> DSOM:
     return nnx.view(nnx.merge(graphdef, *state.average), use_running_average=True)
 
 
-def batch_losses(model: DSOM, batch: Batch, config: TrainConfig) -> Losses:
+def _batch_losses(model: DSOM, batch: Batch, config: TrainConfig) -> Losses:
     """Losses of a batch under a training view."""
     observe = partial(model.observation, lidar=config.scan.lidar)
     observations = jax.vmap(jax.vmap(lambda r, c: observe(r, conditions=c)))(batch.ranges, batch.conditions)
@@ -153,7 +153,7 @@ def batch_losses(model: DSOM, batch: Batch, config: TrainConfig) -> Losses:
 
 
 def make_step(
-    config: TrainConfig, measure: Callable[[DSOM, Batch, TrainConfig], Any] = batch_losses
+    config: TrainConfig, measure: Callable[[DSOM, Batch, TrainConfig], Any] = _batch_losses
 ) -> Callable[[TrainState, Batch, Array], tuple[TrainState, dict[str, Array]]]:
     """The jitted step: (state, batch, total steps) -> (state, metrics). The state given is consumed.
 

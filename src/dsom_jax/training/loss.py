@@ -11,7 +11,7 @@ from dsom_jax.nn.dsom import Outputs
 from dsom_jax.training.target import Target, dense, entropy, pooled
 from dsom_jax.types import Array
 
-PLACES = (-3, -2, -1)
+PLACE_AXES = (-3, -2, -1)
 
 
 class Losses(NamedTuple):
@@ -38,7 +38,7 @@ def cross_entropy(logits: Array, truth: Array, free: Array) -> Array:
     """
     # A large finite number, not -inf: 0 * inf in the product with the truth would be NaN.
     logits = jnp.where(free[..., None], logits, -1e9)
-    return jax.nn.logsumexp(logits, axis=PLACES) - (truth * logits).sum(PLACES)
+    return jax.nn.logsumexp(logits, axis=PLACE_AXES) - (truth * logits).sum(PLACE_AXES)
 
 
 def kld(logits: Array, truth: Array, free: Array) -> Array:

@@ -18,7 +18,7 @@ from dsom_jax import checks
 from dsom_jax.lidar import LidarConfig, LidarNoise, observe
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.raycast import RaycastConfig, cast_rays, make_tables
-from dsom_jax.simulate.drive import DriveConfig, measure
+from dsom_jax.simulate.drive import DriveConfig, measure_odometry
 from dsom_jax.simulate.obstacles import add_obstacles, remove_structure
 from dsom_jax.simulate.paths import drive, roads
 from dsom_jax.training.buildings import make_pool, random_poses
@@ -127,9 +127,9 @@ def make_window(key: Key, pool: PathPool, config: SequenceConfig, resolution: fl
     poses = jax.lax.dynamic_slice(pool.poses, (path, start, jnp.int32(0)), (1, config.window, 3))[0]
     where = pool.where[path]
     grid = OccupancyGrid(pool.occupied[where], pool.free[where], jnp.zeros(3), resolution)
-    ranges = sense(k_scan, spoil_world(k_world, grid, poses, config), poses, config)
+    ranges = _sense(k_scan, spoil_world(k_world, grid, poses, config), poses, config)
     before = jnp.concatenate([poses[:1], poses[:-1]])
-    odometry = measure(k_odometry, before, poses, config.drive.odometry)
+    odometry = measure_odometry(k_odometry, before, poses, config.drive.odometry)
     return Window(where, ranges, odometry, poses, random_poses(k_stray, grid.free, resolution, strays))
 
 
@@ -156,7 +156,7 @@ def path_distance(grid: OccupancyGrid, poses: Array) -> Array:
     return jnp.sqrt(squared.min(0))
 
 
-def sense(key: Key, world: OccupancyGrid, poses: Array, config: SequenceConfig) -> Array:
+def _sense(key: Key, world: OccupancyGrid, poses: Array, config: SequenceConfig) -> Array:
     """Noisy scans (L, B) at ``poses``, the noise of each sequence its own."""
     k_amount, k_observe = jax.random.split(key)
     lidar, r = config.lidar.every(config.beam_step), jax.random.uniform(k_amount, (3,))

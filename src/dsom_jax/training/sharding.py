@@ -14,7 +14,7 @@ from jax.sharding import PartitionSpec as P
 
 from dsom_jax.training.batches import Batch
 
-T = TypeVar("T")
+_T = TypeVar("_T")
 
 
 def data_mesh() -> Mesh:
@@ -22,7 +22,7 @@ def data_mesh() -> Mesh:
     return jax.make_mesh((jax.device_count(),), ("data",), axis_types=(AxisType.Auto,))
 
 
-def replicate(tree: T, mesh: Mesh) -> T:
+def replicate(tree: _T, mesh: Mesh) -> _T:
     """The same arrays on every device; as they are if there is only one."""
     return tree if mesh.size == 1 else jax.device_put(tree, NamedSharding(mesh, P()))
 
@@ -36,7 +36,7 @@ def spread(batch: Batch, mesh: Mesh) -> Batch:
         return batch
     maps, seen = (P("data"), P("data")) if worlds % mesh.size == 0 else (P(), P(None, "data"))
 
-    def place(tree: T, spec: P) -> T:
+    def place(tree: _T, spec: P) -> _T:
         return jax.tree.map(lambda leaf: jax.device_put(leaf, NamedSharding(mesh, spec)), tree)
 
     by_world = {name: place(getattr(batch, name), maps) for name in ("occupied", "free", "views")}

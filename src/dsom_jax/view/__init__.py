@@ -2,9 +2,9 @@
 
 from dsom_jax.view.page import render, write_page
 from dsom_jax.view.picture import trajectory_figure
-from dsom_jax.view.story import DriveStory, Field, Finding, Hypotheses, Lookalike, Plan, Story
+from dsom_jax.view.story import DriveHypotheses, DriveStory, Field, Lookalike, Plan, Remark, Story
 
 __all__ = [
-    "DriveStory", "Field", "Finding", "Hypotheses", "Lookalike", "Plan", "Story",
+    "DriveHypotheses", "DriveStory", "Field", "Lookalike", "Plan", "Remark", "Story",
     "render", "trajectory_figure", "write_page",
 ]  # fmt: skip

@@ -11,7 +11,7 @@ import numpy as np
 
 from dsom_jax.atomic import write_atomic
 from dsom_jax.filters.common import CLUSTER_ANGLE, CLUSTER_RADIUS
-from dsom_jax.view.story import VERDICTS, Hypotheses
+from dsom_jax.view.story import VERDICTS, DriveHypotheses
 
 HEAD = ("stamp", "x", "y", "theta", "sd_x", "sd_y", "sd_theta", "p_lost", "verdict", "hypotheses")
 
@@ -34,7 +34,7 @@ class Answers(NamedTuple):
     spread: np.ndarray
     p_lost: np.ndarray
     verdicts: tuple[str, ...]
-    hypotheses: Hypotheses
+    hypotheses: DriveHypotheses
     particles: np.ndarray
     weights: np.ndarray
 
@@ -46,8 +46,8 @@ def answers(stamps: np.ndarray, poses: np.ndarray, info: Any, kept: Any) -> Answ
     particles, weights = np.asarray(kept.poses, float), particle_weights(kept)
     p_lost = np.asarray(info.p_lost, float)[0]
     verdicts = tuple(VERDICTS[int(number)] for number in np.asarray(info.verdict)[0])
-    places = Hypotheses(*(np.asarray(part)[0] for part in info.hypotheses))
-    return Answers(stamps, said, spread(said, particles, weights), p_lost, verdicts, places, particles, weights)
+    places = DriveHypotheses(*(np.asarray(part)[0] for part in info.hypotheses))
+    return Answers(stamps, said, spreads(said, particles, weights), p_lost, verdicts, places, particles, weights)
 
 
 def particle_weights(kept: Any) -> np.ndarray:
@@ -57,7 +57,7 @@ def particle_weights(kept: Any) -> np.ndarray:
     return np.asarray(kept.normalised, float)
 
 
-def spread(poses: np.ndarray, particles: np.ndarray, weights: np.ndarray) -> np.ndarray:
+def spreads(poses: np.ndarray, particles: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """(T, 3) standard deviations around ``poses`` (T, 3) of the particles in their cluster, of all if it has none."""
     return np.sqrt(np.diagonal(covariances(poses, particles, weights), axis1=1, axis2=2))
 

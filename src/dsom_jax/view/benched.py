@@ -15,9 +15,9 @@ from dsom_jax.data.suite import Suite
 from dsom_jax.judging.by_drive import Worst
 from dsom_jax.view import sketch
 from dsom_jax.view.localized import plan_of
-from dsom_jax.view.page import document, numbers, shown
+from dsom_jax.view.page import document, numbers, readable
 
-COLUMNS = (
+_COLUMNS = (
     ("found", "converged", "percent"),
     ("updates until then", "steps_median", "count"),
     ("right later", "retention", "percent"),
@@ -27,7 +27,7 @@ COLUMNS = (
 """Of the methods: head, key of ``bench.json``, kind of number."""
 INTERVALS = {"e_pos_m": "e_pos_ci95"}
 """Keys of intervals that are not that of the number and ``_ci95``."""
-LEGEND = """Found: 5 updates in a row within 2 m and 10°. Updates until then: median of the runs that found. Right
+_LEGEND = """Found: 5 updates in a row within 2 m and 10°. Updates until then: median of the runs that found. Right
 later: share of the updates after that still within 2 m and 10°. Within 0.5 m at the end: and 5°. Error at the end: mean
 of the runs that found. In brackets: 95 % interval, by drive."""
 HOW = "Runs are numbered from 0. The worst was least often within 2 m and 10°, or of several ends farthest off."
@@ -35,27 +35,27 @@ POINTS = 40_000
 """Points of all paths together, at about ten bytes each; pages of more are thinned."""
 
 
-def write_view(path: Path, suite: Suite, data: Mapping[str, Any], worst: Mapping[str, Sequence[Worst]]) -> None:
+def write_benchmark(path: Path, suite: Suite, data: Mapping[str, Any], worst: Mapping[str, Sequence[Worst]]) -> None:
     """``report.html``, of what ``bench.json`` holds and the ``worst`` run of each method on each drive."""
-    write_atomic(path, render(suite, data, worst).encode())
+    write_atomic(path, render_benchmark(suite, data, worst).encode())
 
 
-def render(suite: Suite, data: Mapping[str, Any], worst: Mapping[str, Sequence[Worst]]) -> str:
+def render_benchmark(suite: Suite, data: Mapping[str, Any], worst: Mapping[str, Sequence[Worst]]) -> str:
     """HTML of a benchmark."""
     data = report.plain(data)
     main = (
         _drawn_once(suite, _most(suite, worst)),
         f'<div id="methods" tabindex="-1">{"".join(_methods(data, phase) for phase in report.phases_of(data))}'
-        f'<p class="caption below">{LEGEND}</p></div>',
+        f'<p class="caption below">{_LEGEND}</p></div>',
         f'{_rows(data)}<p class="caption below">{HOW}</p>',
         *(_drive(suite, data, worst, number) for number in range(len(suite.episodes))),
         numbers("What ran", {name: value for name, value in data.items() if name != "methods"}),
     )
     kicker = f"{data['sequences']} drives · {data['runs']} runs of each · {data['particles']} particles"
-    return document(f"Methods on {suite.name}", kicker, headline(data), main, ("methods", "Skip to the methods"))
+    return document(f"Methods on {suite.name}", kicker, _headline(data), main, ("methods", "Skip to the methods"))
 
 
-def headline(data: Mapping[str, Any]) -> str:
+def _headline(data: Mapping[str, Any]) -> str:
     """Which method found the robot most often, and which least, in words."""
     starts = {"global": "Started anywhere", "kidnap": "Carried away unnoticed"}
     return " ".join(f"{starts[phase]}, {_extremes(data, phase)}." for phase in report.phases_of(data))
@@ -67,7 +67,7 @@ def _extremes(data: Mapping[str, Any], phase: str) -> str:
         return entry[phase]["converged"] or 0.0, -1e9 if error is None else -error
 
     ranked = sorted(data["methods"], key=lambda name: goodness(data["methods"][name]), reverse=True)
-    share = [shown(data["methods"][name][phase]["converged"], "percent") for name in ranked]
+    share = [readable(data["methods"][name][phase]["converged"], "percent") for name in ranked]
     last = f", {ranked[-1]} in {share[-1]}" if len(ranked) > 1 else ""
     return f"{ranked[0]} found the robot in {share[0]} of its runs{last}"
 
@@ -79,7 +79,7 @@ def _number(data: Any, keys: Sequence[Any], kind: str, tag: str = "b") -> str:
     if data is None:
         return "–"
     where = escape(".".join(map(str, keys)))
-    return f'<{tag} data-key="{where}" data-value="{data!r}">{shown(data, kind)}</{tag}>'
+    return f'<{tag} data-key="{where}" data-value="{data!r}">{readable(data, kind)}</{tag}>'
 
 
 def _cell(data: Any, keys: Sequence[Any], kind: str) -> str:
@@ -103,11 +103,11 @@ def _methods(data: Mapping[str, Any], phase: str) -> str:
     """The methods in one phase, a row each, with a link to the worst of their runs."""
     rows = []
     for name, entry in data["methods"].items():
-        cells = "".join(_cell(data, ("methods", name, phase, key), kind) for _, key, kind in COLUMNS)
+        cells = "".join(_cell(data, ("methods", name, phase, key), kind) for _, key, kind in _COLUMNS)
         link = _link(data, name, worst_drive(entry["by_drive"]))
         rows.append(f'<tr><th scope="row">{escape(name)}</th>{cells}<td>{link}</td></tr>')
     count = max(entry[phase]["experiments"] for entry in data["methods"].values())
-    heads = ("method", *(head for head, _, _ in COLUMNS), "worst run")
+    heads = ("method", *(head for head, _, _ in _COLUMNS), "worst run")
     return _table(f"{report.PHASES[phase]}: {count} experiments", heads, f"<tbody>{''.join(rows)}</tbody>")
 
 

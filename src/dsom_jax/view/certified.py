@@ -16,10 +16,10 @@ from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.plotting.common import legend
 from dsom_jax.plotting.maps import map_view, raster
 from dsom_jax.view.localized import plan_of
-from dsom_jax.view.page import shown
+from dsom_jax.view.page import readable
 from dsom_jax.view.story import Field, Lookalike, Story
 
-TILES = (
+_TILES = (
     ("0", "found at first sight", "percent"),
     ("2", "found after 2 m", "percent"),
     ("5", "found after 5 m", "percent"),
@@ -41,7 +41,8 @@ def certificate(
     """What a page says of a building."""
     found, bounds = result["found_after_m"], result["found_after_m_ci95"]
     large = {**found, **{f"{name}_ci95": interval for name, interval in bounds.items()}}
-    text = f"A robot that wakes up anywhere in here is found after 5 m of driving in {shown(found['5'], 'percent')} of"
+    soon = readable(found["5"], "percent")
+    text = f"A robot that wakes up anywhere in here is found after 5 m of driving in {soon} of"
     text += f" {result['drives']} drives."
     after = f"{result['look_alikes_after_m']:g} m"
     text += f" {len(pairs)} pairs of places still look alike after {after}." if pairs else " No two places look alike."
@@ -50,7 +51,7 @@ def certificate(
         text,
         plan_of(grid, lidar, f"{path.name} · {result['area_m2']:.0f} m² of free space"),
         summary=large | {name: result[name] for name in ("metres_median", "area_m2", "drives")},
-        tiles=TILES,
+        tiles=_TILES,
         settings=settings,
         overlay=Field("metres to drive until found, from the nearest start", "m", metres_map(grid, tried),
                       np.asarray(grid.origin), grid.resolution),

@@ -9,15 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from dsom_jax.diagnosis import findings as diagnosed
+from dsom_jax.diagnosis.findings import Finding
 from dsom_jax.judging.scores import Outcome, judged_by
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.occupancy import OccupancyGrid
 from dsom_jax.plotting import save_figure
 from dsom_jax.view.answers import Answers, answers, write_answers
-from dsom_jax.view.page import shown, write_page
+from dsom_jax.view.page import readable, write_page
 from dsom_jax.view.picture import trajectory_figure
-from dsom_jax.view.story import DriveStory, Finding, Plan, Story
+from dsom_jax.view.story import DriveStory, Plan, Remark, Story
 
 JUDGED = (
     ("converged", "of all starts found", "percent"),
@@ -35,7 +35,7 @@ def write_view(
     grid: OccupancyGrid,
     lidar: LidarConfig,
     summary: dict[str, Any],
-    findings: Sequence[diagnosed.Finding],
+    findings: Sequence[Finding],
     notes: Sequence[str],
     settings: Any,
 ) -> tuple[DriveStory, ...]:
@@ -46,16 +46,16 @@ def write_view(
     (``montecarlo.run(..., keep=range(T))``).
     """
     said = [told(outcome, settings.method) for outcome in outcomes]
-    story = tell(outcomes, said, grid, lidar, summary, remarks(findings, notes), settings)
+    story = _tell(outcomes, said, grid, lidar, summary, remarks(findings, notes), settings)
     write_answers(folder / "answers.csv", said)
     save_figure(trajectory_figure(story.plan, story.drives[0]), folder / "trajectory.png")
     write_page(folder / "report.html", story)
     return story.drives
 
 
-def remarks(findings: Sequence[diagnosed.Finding], notes: Sequence[str]) -> tuple[Finding, ...]:
+def remarks(findings: Sequence[Finding], notes: Sequence[str]) -> tuple[Remark, ...]:
     """What the page has to say of map and log."""
-    return (*(Finding(f.says, f.severity, f.fix) for f in findings), *(Finding(note) for note in notes))
+    return (*(Remark(f.says, f.severity, f.fix) for f in findings), *(Remark(note) for note in notes))
 
 
 def told(outcome: Outcome, method: str) -> Answers:
@@ -64,13 +64,13 @@ def told(outcome: Outcome, method: str) -> Answers:
     return answers(outcome.drive.stamps, np.asarray(getattr(info, judged_by(method))), info, outcome.result.kept)
 
 
-def tell(
+def _tell(
     outcomes: list[Outcome],
     said: list[Answers],
     grid: OccupancyGrid,
     lidar: LidarConfig,
     summary: dict[str, Any],
-    findings: tuple[Finding, ...],
+    findings: tuple[Remark, ...],
     settings: Any,
 ) -> Story:
     """The story of all drives."""
@@ -81,7 +81,7 @@ def tell(
     judged = "converged" in summary
     return Story(
         f"Finding the robot in {Path(place).stem}",
-        headline(summary),
+        _headline(summary),
         plan_of(grid, lidar, f"{place} · {log}"),
         drives,
         summary,
@@ -99,22 +99,22 @@ def plan_of(grid: OccupancyGrid, lidar: LidarConfig, name: str) -> Plan:
     return Plan(occupied, free, origin, grid.resolution, lidar.angles(), lidar.mount[:2], name)
 
 
-def headline(summary: dict[str, Any]) -> str:
+def _headline(summary: dict[str, Any]) -> str:
     """What came out, in words."""
     if "converged" not in summary:
-        sure = f"The filter was sure of its answer at {shown(summary['confident'], 'percent')} of"
+        sure = f"The filter was sure of its answer at {readable(summary['confident'], 'percent')} of"
         return f"{sure} {summary['updates']} updates. There is no reference to judge it by."
     starts = summary["experiments"]
-    text = f"Started anywhere, the robot was found in {shown(summary['converged'], 'percent')} of {starts} runs"
+    text = f"Started anywhere, the robot was found in {readable(summary['converged'], 'percent')} of {starts} runs"
     if summary["metres_median"] == summary["metres_median"]:  # none was found: not a number
         driven = summary["metres_median"]
-        text += f", after {shown(driven, 'metres')} of driving (median)" if driven >= 0.1 else ", at once (median)"
+        text += f", after {readable(driven, 'metres')} of driving (median)" if driven >= 0.1 else ", at once (median)"
     if "kidnap" in summary:
-        text += f". Carried away unnoticed, it was found again in {shown(summary['kidnap']['converged'], 'percent')}"
+        text += f". Carried away unnoticed, it was found again in {readable(summary['kidnap']['converged'], 'percent')}"
     rates = [("the updates", summary["false_confident"])]
     if "kidnap" in summary:
         rates.append(("the updates after it was carried away", summary["kidnap"]["false_confident"]))
-    fooled = [f"{shown(rate, 'percent')} of {where}" for where, rate in rates if rate > 0]
+    fooled = [f"{readable(rate, 'percent')} of {where}" for where, rate in rates if rate > 0]
     return f"{text}. It was sure and wrong at {' and at '.join(fooled) if fooled else 'none of the updates'}."
 
 
@@ -129,8 +129,9 @@ def _drive(name: str, outcome: Outcome, said: Answers) -> DriveStory:
 def _segments(summary: dict[str, Any]) -> tuple[str, tuple[str, ...], tuple[tuple[str, ...], ...]]:
     """Table of the segments."""
     rows = tuple(
-        (str(n), f"{part['start_stamp']:.1f} s", shown(part["on_map"], "percent"), shown(part["converged"], "percent"),
-         shown(part["strict_success"], "percent"), shown(part["e_pos_m_median"], "metres"))
+        (str(n), f"{part['start_stamp']:.1f} s",
+         *(readable(part[name], "percent") for name in ("on_map", "converged", "strict_success")),
+         readable(part["e_pos_m_median"], "metres"))
         for n, part in enumerate(summary["by_segment"], 1)
     )  # fmt: skip
     heads = ("segment", "starts at", "on the map", "found", "within 0.5 m at the end", "off at the end, median")

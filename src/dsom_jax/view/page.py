@@ -63,13 +63,13 @@ def _tiles(story: Story) -> str:
         if value is None:
             continue
         bounds = story.summary.get(f"{key}_ci95")
-        note = label + (f" [{' to '.join(shown(b, kind) for b in bounds)}]" if bounds else "")
-        rows.append(f'<li><b data-key="{escape(key)}" data-value="{value!r}">{shown(value, kind)}</b>'
+        note = label + (f" [{' to '.join(readable(b, kind) for b in bounds)}]" if bounds else "")
+        rows.append(f'<li><b data-key="{escape(key)}" data-value="{value!r}">{readable(value, kind)}</b>'
                     f"<span>{escape(note)}</span></li>")  # fmt: skip
     return f'<ul class="tiles">{"".join(rows)}</ul>' if rows else ""
 
 
-def shown(value: float | None, kind: str) -> str:
+def readable(value: float | None, kind: str) -> str:
     """A number as people read it; ``kind`` is percent, metres, count or number."""
     if value is None or not math.isfinite(value):
         return "–"

@@ -140,10 +140,10 @@ def _tell(update: Update, make: MessageMaker, say: Say, lidar: LidarConfig) -> N
     say("/particle_cloud", stamp, make.poses(stamp, update.particles))
     if update.known:
         say("/reference", stamp, make.pose(stamp, update.reference))
-    say("/verdict", stamp, make.text(said(update)))
+    say("/verdict", stamp, make.text(answer_json(update)))
 
 
-def said(update: Update) -> str:
+def answer_json(update: Update) -> str:
     """What there is to know of an answer beside its pose, as JSON."""
     places = [{"weight": w, "x": x, "y": y, "theta": theta} for w, x, y, theta in update.places.tolist()]
     told = {"verdict": update.verdict, "p_lost": update.p_lost, "segment": update.segment,

@@ -13,7 +13,7 @@ from dsom_jax.data.ros2_messages import BASE, LASER, MAP, percentages, quaternio
 from dsom_jax.errors import UserError
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.occupancy import OccupancyGrid
-from dsom_jax.view.recording import Update, draft_of, said, updates
+from dsom_jax.view.recording import Update, answer_json, draft_of, updates
 from dsom_jax.view.story import DriveStory
 
 TIMELINE = "stamp"
@@ -88,7 +88,7 @@ def _tell(rr: Any, out: Any, update: Update, lidar: LidarConfig) -> None:
     # Without a reference none is shown, not the last one.
     out.log(f"{MAP}/reference", _arrows(rr, update.reference[None][: int(update.known)], REFERENCE, 0.6))
     out.log("p_lost", rr.Scalars(update.p_lost))
-    out.log("verdict", rr.TextDocument(said(update)))
+    out.log("verdict", rr.TextDocument(answer_json(update)))
 
 
 def returns(ranges: np.ndarray, lidar: LidarConfig) -> np.ndarray:

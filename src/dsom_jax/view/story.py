@@ -46,7 +46,7 @@ class Plan:
         return local @ np.array([[c, s], [-s, c]]) + np.asarray(self.origin)[:2]
 
 
-class Hypotheses(NamedTuple):
+class DriveHypotheses(NamedTuple):
     """Places that may be the right one: at most H for each of T updates, filled up with weights of zero.
 
     Attributes:
@@ -87,7 +87,7 @@ class DriveStory:
     ranges: np.ndarray
     particles: np.ndarray
     particle_weights: np.ndarray
-    hypotheses: Hypotheses
+    hypotheses: DriveHypotheses
 
     def __post_init__(self) -> None:
         count = len(self.stamps)
@@ -104,7 +104,7 @@ class DriveStory:
         return np.hypot(gap[:, 0], gap[:, 1]), np.abs((gap[:, 2] + np.pi) % (2 * np.pi) - np.pi)
 
 
-class Finding(NamedTuple):
+class Remark(NamedTuple):
     """Something that a reader of map or log, or the run itself, has to say."""
 
     says: str
@@ -153,7 +153,7 @@ class Story:
     summary: dict[str, Any] = field(default_factory=dict)
     tiles: tuple[tuple[str, str, str], ...] = ()
     tables: tuple[tuple[str, tuple[str, ...], tuple[tuple[str, ...], ...]], ...] = ()
-    findings: tuple[Finding, ...] = ()
+    findings: tuple[Remark, ...] = ()
     settings: dict[str, Any] = field(default_factory=dict)
     overlay: Field | None = None
     lookalikes: tuple[Lookalike, ...] = ()
