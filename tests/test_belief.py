@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import tiny_world
-from dsom_jax.belief.grid_belief import GridBeliefConfig, grid_belief, novelty
+from dsom_jax.belief.grid_belief import GridBeliefConfig, first_set, grid_belief, novelty
 from dsom_jax.belief.moving import moved_everywhere
 from dsom_jax.geometry import relative
 from dsom_jax.lidar import LidarConfig
@@ -56,7 +56,7 @@ def dense(belief, mass):
 
 def on_map(belief, memory):
     """(H, W, K) whichever way the memory holds it."""
-    mass = belief._spread(memory.rows, memory.focus) if bool(memory.focused) else memory.mass
+    mass = belief._spread(memory.rows, memory.focus) if bool(memory.held) else memory.mass
     return dense(belief, mass)
 
 
@@ -145,6 +145,17 @@ def test_a_focus_gives_what_the_whole_grid_gives(tiny):
         assert np.abs(on_map(tiny, near) - on_map(whole, full)).sum() < 2e-3 * (t + 1)
         assert float(near.off) == pytest.approx(float(full.off), abs=1e-3)
     assert any(looked[:-1]) and not bool(full.focused)
+
+
+@pytest.mark.parametrize("n", [5, 64, 1000])
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.5, 1.0])
+def test_first_set_is_flatnonzero(n, share):
+    flags = np.random.default_rng(n).random(n) < share
+    for count in (3, 70):
+        found = np.full(count, n)
+        where = np.flatnonzero(flags)[:count]
+        found[: len(where)] = where
+        np.testing.assert_array_equal(first_set(jnp.asarray(flags), count), found)
 
 
 def test_the_pool_stands_for_the_belief(tiny):

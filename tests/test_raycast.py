@@ -15,13 +15,14 @@ import pytest
 from dsom_jax import marching, raycast
 from dsom_jax.errors import UserError
 from dsom_jax.lidar import LidarConfig
-from dsom_jax.marching import empty_squares
+from dsom_jax.marching import empty_squares, empty_wedges
 from dsom_jax.occupancy import from_cells
 from dsom_jax.raycast import RaycastConfig, make_tables
 from reference import rays
 
 cast_rays = jax.jit(raycast.cast_rays, static_argnums=2)
 EXACT = RaycastConfig("exact")
+WEDGES = RaycastConfig("exact", wedges=3, max_skip=30)
 CELLS = 2e-3  # promised accuracy, and the clearance of corners below which no side can be told
 FAN = LidarConfig(beams=37, angle_min=-3.1, angle_increment=0.17, range_max=12.0)
 FOUR = LidarConfig(beams=4, angle_min=-math.pi, angle_increment=math.pi / 2, range_max=10.0)  # back, right, ahead, left
@@ -98,23 +99,25 @@ def test_room_by_hand():
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("density", [0.01, 0.15])
-def test_random_maps_against_the_slow_reference(seed, density):
+@pytest.mark.parametrize("method", [EXACT, WEDGES], ids=["squares", "wedges"])
+def test_random_maps_against_the_slow_reference(seed, density, method):
     occupied = random_map(seed, density=density)
     origin = (-3.0, 5.0, 0.6 * seed)
     grid = from_cells(occupied, resolution=0.2, origin=origin)
     poses = np.asarray(grid.from_grid(jnp.asarray(random_poses(seed, (11,), (9.0, 6.2)), jnp.float32)))
-    ranges = cast_rays(make_tables(grid, EXACT, FAN.range_max), poses, FAN)
+    ranges = cast_rays(make_tables(grid, method, FAN.range_max), poses, FAN)
     share = assert_like_reference(ranges, occupied, 0.2, origin, poses, FAN.angles(), FAN.range_max)
     assert share > 0.9
 
 
-def test_long_corridor_with_grazing_rays():
+@pytest.mark.parametrize("method", [EXACT, WEDGES], ids=["squares", "wedges"])
+def test_long_corridor_with_grazing_rays(method):
     # 300 cells long and 3 wide: hundreds of leaps along the wall.
     occupied = np.ones((5, 300), bool)
     occupied[1:4, 1:-1] = False
     lidar = LidarConfig(beams=41, angle_min=-0.02, angle_increment=0.001, range_max=40.0)
     poses = np.array([[0.15, 0.27, 0.0], [0.3, 0.12, 0.0], [0.155, 0.2513, 0.001]])
-    tables = make_tables(from_cells(occupied, resolution=0.1), EXACT, 40.0)
+    tables = make_tables(from_cells(occupied, resolution=0.1), method, 40.0)
     ranges = np.asarray(cast_rays(tables, jnp.asarray(poses, jnp.float32), lidar))
     for pose, row in zip(poses, ranges, strict=True):
         # A float32 angle is off by 3e-7 rad; at 1e-2 rad of incidence and 25 m that is worth a millimetre.
@@ -219,6 +222,43 @@ def test_empty_squares_by_brute_force():
                     cols = slice(j, j + n) if right else slice(max(j - n + 1, 0), j + 1)
                     side = n if not blocked[rows, cols].any() else side
                 assert sides[layer, i, j] == side, (up, right, i, j)
+
+
+@pytest.mark.parametrize("sectors", [1, 3])
+def test_empty_wedges_by_rays_from_all_over_the_cell(sectors):
+    # Border and all, as the march has it; no ray of a sector may meet a wall in the columns promised.
+    blocked = np.pad(random_map(4, (16, 19), 0.06), 1, constant_values=True)
+    cap = 9
+    wedges = np.asarray(empty_wedges(jnp.asarray(blocked), sectors, cap))
+    assert wedges.shape == (8 * sectors, *blocked.shape)
+    assert (wedges[:, blocked] == 0).all() and (wedges[:, ~blocked] > 0).all() and wedges.max() <= cap + 1
+    rng, longest = np.random.default_rng(0), 0
+    for layer, promised in enumerate(wedges):
+        octant, sector = divmod(layer, sectors)
+        steep, up, right = octant // 4, 1 if octant % 4 // 2 else -1, 1 if octant % 2 else -1
+        for i, j in rng.permutation(np.argwhere(~blocked))[:60]:
+            columns = int(promised[i, j]) - 1
+            longest = max(longest, columns)
+            for _ in range(30):
+                slope = (sector + rng.random()) / sectors
+                direction = np.array([slope, 1.0] if steep else [1.0, slope]) * (right, up)
+                start = np.array([j, i]) + rng.random(2)
+                way = start + np.arange(0.001, cap + 2, 0.01)[:, None] * direction
+                crossed = np.abs(np.floor(way[:, 1 if steep else 0]) - (i if steep else j))
+                cells = np.floor(way[crossed < columns]).astype(int)
+                assert not blocked[cells[:, 1], cells[:, 0]].any(), (layer, i, j)
+    assert longest > 4  # so that there was something to be wrong about
+
+
+def test_wedges_of_a_bare_hall_by_hand():
+    blocked = np.ones((5, 9), bool)
+    blocked[1:4, 1:8] = False
+    ahead = np.asarray(empty_wedges(jnp.asarray(blocked), 4, 20))
+    # Along x towards up and right (octant 3), slopes below 1/4: from the lowest row at the left a ray climbs to just
+    # below 1 + 8/4 = 3 rows within 7 columns, and the wall is behind the seventh; one row up it may hit the ceiling.
+    assert ahead[3 * 4, 1, 1] == 1 + 7
+    assert ahead[3 * 4, 3, 1] == 1  # the ceiling is met in the own column
+    assert ahead[2 * 4, 1, 7] == 1 + 7  # the same to the left
 
 
 def test_table_against_exact(house):

@@ -126,12 +126,10 @@ def dilate(cells: Array, steps: int = 1) -> Array:
     for axis in (-2, -1):
         width = [(0, 0)] * (cells.ndim - 1)
         width.insert(cells.ndim + axis, (steps, steps))
-        counts = jnp.cumsum(jnp.pad(cells, width), axis=axis, dtype=jnp.int32)
-        first = jnp.zeros_like(jax.lax.slice_in_dim(counts, 0, 1, axis=axis))
-        counts = jnp.concatenate([first, counts], axis=axis)
-        n = cells.shape[axis]
-        upper = jax.lax.slice_in_dim(counts, 2 * steps + 1, 2 * steps + 1 + n, axis=axis)
-        cells = upper > jax.lax.slice_in_dim(counts, 0, n, axis=axis)
+        padded, n = jnp.pad(cells, width), cells.shape[axis]
+        cells = padded[..., :n, :] if axis == -2 else padded[..., :n]
+        for k in range(1, 2 * steps + 1):
+            cells |= jax.lax.slice_in_dim(padded, k, k + n, axis=axis)
     return cells
 
 

@@ -36,6 +36,7 @@ _FAINT = 1e-7
 """Share of the mass below which a row is empty."""
 _AWAY = 0.02
 """Mass off the map from which on the whole grid is judged."""
+_BLOCK = 64
 _NEWS = 0.25
 """Novelty of a scan below which the belief waits for more."""
 
@@ -68,8 +69,8 @@ class GridBeliefConfig:
     enter: float = 0.02
     explained: float = 0.2
     fits: float = -1.7
-    rows: int = 384
-    reach: int = 3
+    rows: int = 256
+    reach: int = 2
     pool: int = 2048
     samples: int = 512
 
@@ -85,10 +86,11 @@ class Memory(NamedTuple):
     """The belief after an update.
 
     Attributes:
-        mass: (C, K) by free cell and heading; means nothing while the belief is focused.
+        mass: (C, K) by free cell and heading; means nothing while ``held``.
         rows: (M,) cells of the focus, C where there are fewer.
-        focus: (M, K) mass of these; all that there is on the map while the belief is focused.
-        focused: () bool, nearly all mass lies in ``rows``, and the scan fits there.
+        focus: (M, K) mass of these; all that there is on the map while ``held``.
+        held: () bool, the focus holds the belief, not ``mass``.
+        focused: () bool, it does, and the scan fits there.
         off: () mass off the map; all of it sums to one.
         pool: what was drawn of it.
         scan: (B,) the last one that counted, to tell what is new in the next.
@@ -98,6 +100,7 @@ class Memory(NamedTuple):
     mass: Array
     rows: Array
     focus: Array
+    held: Array
     focused: Array
     off: Array
     pool: Pool
@@ -122,11 +125,11 @@ class Places(NamedTuple):
 
 
 class _Judged(NamedTuple):
-    """The belief after one way of updating it, fields as in :class:`Memory`."""
+    """The belief after one way of updating it, but for the whole grid; fields as in :class:`Memory`."""
 
-    mass: Array
     rows: Array
     focus: Array
+    held: Array
     focused: Array
     off: Array
     pool: Pool
@@ -157,7 +160,8 @@ class GridBelief:
         rows = jnp.full(self.config.rows, count, jnp.int32)
         scan = jnp.full(self.likelihood.lidar.beams, jnp.nan)
         focus = jnp.zeros((self.config.rows, headings))
-        return Memory(self._even(), rows, focus, jnp.bool_(False), jnp.float32(0.0), pool, scan, jnp.zeros(3))
+        no = jnp.bool_(False)
+        return Memory(self._even(), rows, focus, no, no, jnp.float32(0.0), pool, scan, jnp.zeros(3))
 
     def around(self, pose: Array, covariance: Array) -> Memory:
         """Belief that is Gaussian about a base pose (3,); no narrower than a cell."""
@@ -185,21 +189,25 @@ class GridBelief:
         counts = fresh > _NEWS
         rows, fits = self._reachable(memory, odometry)
         near = memory.focused & fits & ~first
-        way = jnp.where(counts, jnp.where(near, 1, 2), 0)
-        judged = jax.lax.switch(
-            way, (self._held, self._near, self._everywhere), memory, rows, odometry, inputs.ranges, fresh
+        judged = jax.lax.cond(counts & near, self._near, self._waiting, memory, rows, odometry, inputs.ranges, fresh)
+        # A loop of one turn or none: unlike a branch, it leaves the mass of the whole grid where it is.
+        whole = jax.lax.while_loop(
+            lambda state: state[0],
+            lambda state: (jnp.bool_(False), *self._everywhere(memory, state[1], odometry, inputs.ranges, fresh)),
+            (counts & ~near, memory.mass, judged),
         )
+        _, mass, judged = whole
         scan, pending = jnp.where(counts, inputs.ranges, memory.scan), jnp.where(counts, 0.0, odometry)
         stride = max(1, self.config.pool // self.config.samples)
         cell, k = judged.pool.cell[::stride], judged.pool.heading[::stride]
         poses = self.likelihood.poses_in(cell, k, even(cell.size, 3))
         places = Places(judged.pool, poses, judged.off, jnp.where(counts, fresh, 0.0))
-        return places, Memory(**judged._asdict(), scan=scan, pending=pending)
+        return places, Memory(mass, **judged._asdict(), scan=scan, pending=pending)
 
-    def _held(self, memory: Memory, rows: Array, odometry: Array, ranges: Array, fresh: Array) -> _Judged:
+    def _waiting(self, memory: Memory, rows: Array, odometry: Array, ranges: Array, fresh: Array) -> _Judged:
         """Nothing new: the belief as it was."""
         pool = memory.pool._replace(log_prior=memory.pool.log_posterior)
-        return _Judged(memory.mass, memory.rows, memory.focus, memory.focused, memory.off, pool)
+        return _Judged(memory.rows, memory.focus, memory.held, memory.focused, memory.off, pool)
 
     def _near(self, memory: Memory, rows: Array, odometry: Array, ranges: Array, fresh: Array) -> _Judged:
         """All mass stays within ``rows`` (M,), the cells that it can reach."""
@@ -208,6 +216,8 @@ class GridBelief:
         old = self.likelihood.cells.at[memory.rows].get(mode="fill", fill_value=size)
         slot = jnp.full(size, self.config.rows, jnp.int32).at[old].set(jnp.arange(self.config.rows), mode="drop")
         moved = moved_mass(self.likelihood, memory.focus, slot, cells, odometry, self.config.slip)
+        # Without the barrier XLA moves the mass once for its sum, and again for its shares.
+        moved = jax.lax.optimization_barrier(moved)
         # Where all of it would leave free space, it stays near.
         moved = jnp.where((rows < count)[:, None], moved + 1e-12, 0.0)
         away = self._away(memory)
@@ -218,13 +228,17 @@ class GridBelief:
         by_row = posterior.sum(-1)
         rows = jnp.where(by_row > _FAINT, rows, count)
         focus = jnp.where((rows < count)[:, None], posterior, 0.0)
-        mass = jax.lax.cond(focused, lambda: memory.mass, lambda: self._spread(rows, focus))
         pool = draw(self.likelihood, cells, prior, posterior, self.config.pool)
-        return _Judged(mass, rows, focus, focused, off, pool)
+        return _Judged(rows, focus, jnp.bool_(True), focused, off, pool)
 
-    def _everywhere(self, memory: Memory, rows: Array, odometry: Array, ranges: Array, fresh: Array) -> _Judged:
-        """All cells moved and judged; here those who are carried away, or come back, come down."""
-        mass = jax.lax.cond(memory.focused, lambda: self._spread(memory.rows, memory.focus), lambda: memory.mass)
+    def _everywhere(
+        self, memory: Memory, mass: Array, odometry: Array, ranges: Array, fresh: Array
+    ) -> tuple[Array, _Judged]:
+        """All cells moved and judged; here those who are carried away, or come back, come down.
+
+        ``mass`` (C, K) is that of ``memory``.
+        """
+        mass = jax.lax.cond(memory.held, lambda: self._spread(memory.rows, memory.focus), lambda: mass)
         moved = jax.lax.cond(
             (odometry == 0).all(),
             lambda: mass,
@@ -236,12 +250,12 @@ class GridBelief:
         posterior, off, level = self._bayes(prior, away, ranges, fresh)
         by_row = posterior.sum(-1)
         holds = by_row > _FAINT * by_row.sum()
-        rows = jnp.flatnonzero(holds, size=self.config.rows, fill_value=self._shape[0]).astype(jnp.int32)
+        rows = first_set(holds, self.config.rows)
         held = jnp.where(holds, by_row, 0.0).sum() >= (1 - _SPILT) * by_row.sum()
         focused = held & (holds.sum() <= self.config.rows) & (off < _AWAY) & (level > self.config.fits)
         focus = posterior.at[rows].get(mode="fill", fill_value=0.0)
         pool = draw(self.likelihood, self.likelihood.cells, prior, posterior, self.config.pool)
-        return _Judged(posterior, rows, focus, focused, off, pool)
+        return posterior, _Judged(rows, focus, focused, focused, off, pool)
 
     def _spread(self, rows: Array, focus: Array) -> Array:
         """(C, K) of the masses (M, K) of a focus."""
@@ -296,8 +310,8 @@ class GridBelief:
             there = (cells < grid.height * grid.width) & (y >= 0) & (x >= 0)
             image = image.at[jnp.where(there, y, grid.height), x].set(True, mode="drop")
         image = dilate(image, self.config.reach) & self.likelihood.free
-        cells = jnp.flatnonzero(image, size=self.config.rows, fill_value=grid.height * grid.width)
-        swings = self._swing(odometry) >= (self.config.reach - 2) * grid.resolution
+        cells = first_set(image.reshape(-1), self.config.rows)
+        swings = self._swing(odometry) > (self.config.reach - 2) * grid.resolution
         return self.row_of[cells], (image.sum() <= self.config.rows) & ~swings
 
     def sample(self, key: Key, prepared: Places, n: int) -> tuple[Array, Array]:
@@ -318,10 +332,25 @@ def grid_belief(likelihood: LikelihoodGrid, grid: OccupancyGrid, config: GridBel
     """Belief on the cells of a likelihood grid that was made for the map ``grid``."""
     cells, size = likelihood.cells, likelihood.free.size
     number = jnp.arange(cells.size, dtype=jnp.int32)
-    row_of = jnp.full(size + 1, cells.size, jnp.int32).at[cells].set(number, mode="drop")
+    real = jnp.where(cells < size, cells, size + 1)
+    row_of = jnp.full(size + 1, cells.size, jnp.int32).at[real].set(number, mode="drop")
     at_edge = (dilate(_unknown(likelihood, grid), 2) & likelihood.free).reshape(-1)
     frontier = at_edge.at[cells].get(mode="fill", fill_value=False).astype(jnp.float32)[:, None]
     return GridBelief(likelihood, row_of, normalised(frontier), config)
+
+
+def first_set(flags: Array, count: int) -> Array:
+    """(M,) int32 where the first ``count`` of ``flags`` (n,) are set, in order; n where there are fewer.
+
+    By blocks, of which at most ``count`` are looked into: a running sum over a large map takes long.
+    """
+    n = flags.size
+    blocks = jnp.pad(flags, (0, -n % _BLOCK)).reshape(-1, _BLOCK)
+    some = jnp.flatnonzero(blocks.any(-1), size=count, fill_value=len(blocks))
+    within = blocks.at[some].get(mode="fill", fill_value=False)
+    at = jnp.flatnonzero(within.reshape(-1), size=count, fill_value=within.size)
+    block = some.at[at // _BLOCK].get(mode="fill", fill_value=len(blocks))
+    return jnp.minimum(block * _BLOCK + at % _BLOCK, n).astype(jnp.int32)
 
 
 def _unknown(likelihood: LikelihoodGrid, grid: OccupancyGrid) -> Array:

@@ -35,11 +35,18 @@ def draw(likelihood: LikelihoodGrid, cells: Array, prior: Array, posterior: Arra
     """``n`` of ``cells`` (m,) and headings by the posterior (m, K), one stratum each along the cells."""
     by_row = posterior.sum(-1)
     row = pick(jnp.cumsum(by_row), (jnp.arange(n) + 0.5) / n)
-    k = pick_in_rows(jnp.cumsum(posterior[row], -1), jnp.arange(n), even(n, 1)[0])
+    k = pick_in_rows(*_along_headings(posterior, row), even(n, 1)[0])
     cell = cells[row]
     volume = likelihood.log_volume(cell)
     log_prior = jnp.log(prior[row, k] / prior.sum()) - volume
     return Pool(cell, k, log_prior, jnp.log(posterior[row, k] / by_row.sum()) - volume)
+
+
+def _along_headings(posterior: Array, row: Array) -> tuple[Array, Array]:
+    """Running sums over the headings and the rows (n,) of them, of all cells or those picked: whichever are fewer."""
+    if len(posterior) < len(row):
+        return jnp.cumsum(posterior, -1), row
+    return jnp.cumsum(posterior[row], -1), jnp.arange(len(row))
 
 
 def even(n: int, axes: int) -> Array:

@@ -114,7 +114,7 @@ REAL = Settings(
     particles=500,
     max_beams=60,
     raycast=RaycastConfig("table", surface=_SCANNED),
-    robust_raycast=RaycastConfig("exact", surface=_SCANNED),
+    robust_raycast=RaycastConfig("exact", max_skip=127, wedges=8, surface=_SCANNED),
     grid=LikelihoodGridConfig(raycast=RaycastConfig("exact", surface=_SCANNED)),
     memory=True,
 )
