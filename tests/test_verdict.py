@@ -66,7 +66,23 @@ def test_a_perfect_answer_shows_no_sign():
     signs, _ = watched(0.0)
     # The chord of an arc is half a turn ahead of its tangent: 0.06 rad, of which a third is believed after 1.35 m.
     for name, value in signs._asdict().items():
-        assert float(value) < (0.08 if name == "crab" else 0.02), name
+        # exp(-1.35 / 0.45) is left of what only driving can show.
+        assert float(value) < {"crab": 0.08, "fresh": 0.051}.get(name, 0.02), name
+
+
+def test_nothing_is_believed_before_the_robot_has_driven():
+    watcher = monitor(tiny_world.tables(), tiny_world.LIDAR)
+    scan = jnp.full(tiny_world.LIDAR.beams, jnp.nan)
+    step, zero = jax.jit(watcher.watch), jnp.float32(0.0)
+    track, fresh = watcher.start(jnp.zeros(3)), []
+    for t, travel in enumerate([5.0, 0.0, 0.0, 0.9]):  # that of the first update is none; then turns on the spot
+        pose = jnp.array([0.9 * (t == 3), 0.0, 0.5 * min(t, 2)])
+        odometry = jnp.array([travel, 0.0, 0.5])
+        track, signs = step(track, pose, scan, odometry, jnp.bool_(t == 0), zero, zero)
+        fresh.append(float(signs.fresh))
+    np.testing.assert_allclose(fresh, [1, 1, 1, math.exp(-2)], rtol=1e-5)
+    told = step(watcher.start(jnp.zeros(3)), jnp.zeros(3), scan, jnp.zeros(3), jnp.bool_(False), zero, zero)
+    assert float(told[1].fresh) == 0.0
 
 
 def test_a_turned_lidar_shows_as_a_crab():

@@ -33,7 +33,7 @@ from dsom_jax.types import Array
 
 PRIOR = {
     "miss": 0.7, "long": 0.3, "miss_now": 1.2, "long_now": 0.8, "unknown": 0.9, "blind": 2.0, "crab": 0.175,
-    "backward": 1.0, "stretch": 0.6, "slide": 0.5, "turn": 0.25, "jump": 1.3, "fresh": 1.6,
+    "backward": 1.0, "stretch": 0.6, "slide": 0.5, "turn": 0.25, "jump": 1.3, "fresh": 1.0,
 }  # fmt: skip
 HEADER = '"""Tolerances of ``p_lost``, written by ``experiments/trust/learn.py``: not to be edited by hand."""'
 SLOPE = 6.0

@@ -230,7 +230,9 @@ def measure(case: Case, runs: int) -> tuple[dict[str, Any], np.ndarray]:
     pooled = {name: [part for j in judged if (part := j[name]) is not None] for name in judged[0]}
     said = np.stack([np.concatenate(pooled.pop("p_lost")), np.concatenate(pooled["wrong"])], -1)
     values = {name: np.concatenate(parts) if parts else np.empty(0) for name, parts in pooled.items()}
-    return {name: round(float(v.mean()), 4) if v.size else None for name, v in values.items()}, said
+    row = {name: round(float(v.mean()), 4) if v.size else None for name, v in values.items()}
+    row["first_localized"] = round(float(np.median(values["first_localized"])), 1)
+    return row, said
 
 
 def judge(case: Case, number: int, info: Any, episode: Episode) -> dict[str, np.ndarray | None]:

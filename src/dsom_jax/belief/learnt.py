@@ -1,7 +1,7 @@
 """Tolerances of ``p_lost``, written by ``experiments/trust/learn.py``.
 
-Since then ``backward`` was added by hand, and the doubt became an 8-norm in place of a 4-norm:
-the fit is to be run again.
+Since then ``backward`` was added by hand, ``fresh`` made one of the way driven, and the doubt became an 8-norm in place
+of a 4-norm: the fit is to be run again.
 """
 
 SLOPE = 6.0
@@ -18,6 +18,6 @@ TOLERANCES = {
     "slide": 0.6155,
     "turn": 0.5129,
     "jump": 1.85,
-    "fresh": 1.639,
+    "fresh": 1.0,
 }
 MADE = {"drives": 194, "runs": 3, "seed": 3, "ridge": 0.02}

@@ -16,6 +16,8 @@ from dsom_jax.marching import empty_squares
 from dsom_jax.raycast import MapTables, cast_rays
 from dsom_jax.types import Array
 
+_UNTRIED = 0.45
+"""Metres that leave a third of the doubt of the start: turning alone does not show how a lidar is mounted."""
 _MINUTES = 0.97
 """Share of the past that an update keeps of the way driven backwards."""
 _TOLERANCE = 0.3
@@ -71,6 +73,7 @@ class Track(NamedTuple):
         cross, along, squared: () faded sums of reported x answered steps: crosswise, along, and of the reported ones;
             a step that was answered backwards counts as one forth, as some encoders do not tell the two apart.
         back, path: () metres answered backwards, and all, in the last minutes.
+        driven: () metres reported since the start.
         slide, turn: () faded sums of squared gaps between reported and answered steps (m^2) and turns (rad^2).
         steps: () faded number of steps.
         jump: () faded number of steps that no odometry explains.
@@ -84,6 +87,7 @@ class Track(NamedTuple):
     squared: Array
     back: Array
     path: Array
+    driven: Array
     slide: Array
     turn: Array
     steps: Array
@@ -106,7 +110,7 @@ class Signs(NamedTuple):
         slide: reported and answered steps differ by this share of a step.
         turn: root mean square of the gap between reported and answered turns, radians.
         jump: recent steps that no odometry explains.
-        fresh: 1 at the first update, fading.
+        fresh: 1 at the start, fading with the way driven.
     """
 
     elsewhere: Array
@@ -146,9 +150,12 @@ class Monitor:
     slow: float = field(default=0.9, metadata={"static": True})
 
     def start(self, pose: Array) -> Track:
-        """Nothing seen; ``pose`` (3,) is where the odometry of the next update begins, if it is not the first."""
+        """Nothing seen; ``pose`` (3,) is where the odometry of the next update begins, if it is not the first.
+
+        Whoever told the pose need not wait until the robot has driven.
+        """
         zero = jnp.float32(0.0)
-        return Track(pose, jnp.zeros(5), *[zero] * 10)
+        return Track(pose, jnp.zeros(5), *[zero] * 11)._replace(driven=jnp.float32(jnp.inf))
 
     def watch(
         self,
@@ -196,6 +203,7 @@ class Monitor:
             squared=keep * track.squared + use * travel**2,
             back=long * track.back + use * travel * backward,
             path=long * track.path + use * travel,
+            driven=jnp.where(first, 0.0, track.driven + travel),
             slide=keep * track.slide + use * jnp.where(use > 0, off, 0.0) ** 2,
             turn=keep * track.turn + use * gap**2,
             steps=keep * track.steps + use,
@@ -224,7 +232,7 @@ class Monitor:
             slide=sure * jnp.sqrt(track.slide / jnp.maximum(track.steps, 1e-6) / (length + 0.01)),
             turn=jnp.sqrt(track.turn / jnp.maximum(track.steps, 1.0)),
             jump=track.jump,
-            fresh=jnp.exp(-track.steps),
+            fresh=jnp.exp(-track.driven / _UNTRIED),
         )
 
 
@@ -233,4 +241,4 @@ def monitor(tables: MapTables, lidar: LidarConfig, beams: int = 120) -> Monitor:
     step = max(1, lidar.beams // beams)
     grid = replace(tables.grid, occupied=~tables.grid.free)
     squares = empty_squares(jnp.pad(grid.occupied, 1, constant_values=True), 63)
-    return Monitor(tables, replace(tables, grid=grid, squares=squares, walls=None), lidar.every(step), step)
+    return Monitor(tables, replace(tables, grid=grid, empty=squares, walls=None), lidar.every(step), step)
