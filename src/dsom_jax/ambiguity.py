@@ -27,7 +27,7 @@ from dsom_jax.simulate.drive import DriveConfig, measure_odometry
 from dsom_jax.simulate.paths import drive, roads
 from dsom_jax.types import Array, Inputs
 
-POSITION, ANGLE, SURE = 2.0, math.radians(10), 0.95
+_POSITION, _ANGLE, _SURE = 2.0, math.radians(10), 0.95
 """The robot is found once so much of the belief lies within 2 m and 10 deg of where it is."""
 
 
@@ -78,7 +78,7 @@ class Tried(NamedTuple):
 
     def metres_until_found(self) -> np.ndarray:
         """(D,) metres driven until the belief is sure of the truth; infinite if it never is."""
-        found = self.truth >= SURE
+        found = self.truth >= _SURE
         return np.where(found.any(1), self.metres[np.arange(len(found)), found.argmax(1)], np.inf)
 
 
@@ -163,10 +163,10 @@ def _places(belief: MarkovGrid, mass: Array, pose: Array) -> tuple[Array, Array,
     mount = jnp.array([likelihood.lidar.mount[0], likelihood.lidar.mount[1], 0.0])
     # Cells that fill up lie behind the last row: far from everything.
     i, j = jnp.divmod(cells, grid.width)
-    angle = max(ANGLE, 1.5 * grid.turn)
+    angle = max(_ANGLE, 1.5 * grid.turn)
 
     def near(at: tuple[Array, Array, Array]) -> Array:
-        close = jnp.hypot(i - at[0], j - at[1]) * grid.resolution <= POSITION
+        close = jnp.hypot(i - at[0], j - at[1]) * grid.resolution <= _POSITION
         gap = (jnp.arange(grid.headings) - at[2] + grid.headings / 2) % grid.headings - grid.headings / 2
         return close[:, None] & (jnp.abs(gap) * grid.turn <= angle)
 

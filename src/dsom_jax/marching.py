@@ -102,16 +102,16 @@ class _Fan(NamedTuple):
 
     def rays(self) -> tuple[Array, Array, Array, Array]:
         """x, y and direction of all rays, broadcast against (P, B)."""
-        return self.x, self.y, *turned(self.cos, self.sin, self.beam_cos, self.beam_sin)
+        return self.x, self.y, *direction_of(self.cos, self.sin, self.beam_cos, self.beam_sin)
 
     def at(self, ray: Array) -> tuple[Array, Array, Array, Array]:
         """x, y and direction of the rays with numbers ``ray`` (G,), counted pose by pose."""
         pose, beam = ray // self.beam_cos.size, ray % self.beam_cos.size
         x, y, c, s = (take(v[:, 0], pose) for v in (self.x, self.y, self.cos, self.sin))
-        return x, y, *turned(c, s, take(self.beam_cos, beam), take(self.beam_sin, beam))
+        return x, y, *direction_of(c, s, take(self.beam_cos, beam), take(self.beam_sin, beam))
 
 
-def turned(c: Array, s: Array, beam_cos: Array, beam_sin: Array) -> tuple[Array, Array]:
+def direction_of(c: Array, s: Array, beam_cos: Array, beam_sin: Array) -> tuple[Array, Array]:
     """Unit vector of heading + bearing by the addition theorem: no trigonometry per ray."""
     return c * beam_cos - s * beam_sin, s * beam_cos + c * beam_sin
 

@@ -17,7 +17,7 @@ from dsom_jax import checks
 from dsom_jax.errors import UserError
 from dsom_jax.geometry import compose
 from dsom_jax.lidar import LidarConfig
-from dsom_jax.marching import empty_squares, empty_wedges, flat_index, march, take, turned
+from dsom_jax.marching import direction_of, empty_squares, empty_wedges, flat_index, march, take
 from dsom_jax.occupancy import OccupancyGrid, inside
 from dsom_jax.types import Array
 
@@ -126,7 +126,7 @@ def cast_rays(tables: MapTables, poses: Array, lidar: LidarConfig) -> Array:
 def _directions(theta: Array, bearings: Array) -> tuple[Array, Array]:
     """Unit vectors of ``theta`` (...) + ``bearings`` (B,)."""
     c, s = jnp.cos(theta)[..., None], jnp.sin(theta)[..., None]
-    return turned(c, s, jnp.cos(bearings), jnp.sin(bearings))
+    return direction_of(c, s, jnp.cos(bearings), jnp.sin(bearings))
 
 
 def _first_walls(tables: MapTables, angles: int, viewpoints: int) -> Array:

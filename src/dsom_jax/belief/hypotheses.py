@@ -15,7 +15,7 @@ PLACES = 8
 """Hypotheses that are told apart."""
 _HELD = 0.99
 """Share of the mass that the places have to hold; what is left is none."""
-RADIUS, ANGLE = 1.5, math.radians(25.0)
+_RADIUS, _ANGLE = 1.5, math.radians(25.0)
 """What lies this near to a place's mean belongs to it, metres and radians."""
 
 
@@ -63,7 +63,7 @@ def share_at(poses: Array, place: Array) -> Array:
 
 
 def _near(poses: Array, place: Array) -> Array:
-    close = ((poses[..., :2] - place[..., :2]) ** 2).sum(-1) <= RADIUS**2
+    close = ((poses[..., :2] - place[..., :2]) ** 2).sum(-1) <= _RADIUS**2
     # Headings lie within one turn of each other; a remainder for every pair would take ten times as long.
     turn = jnp.pi - jnp.abs(jnp.pi - jnp.abs(poses[..., 2] - place[..., 2]))
-    return close & (turn <= ANGLE)
+    return close & (turn <= _ANGLE)

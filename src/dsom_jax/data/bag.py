@@ -15,13 +15,13 @@ from dsom_jax.data.bag_file import listed, messages_of_topics, open_bag
 from dsom_jax.data.bag_reference import REFERENCES, reference_of
 from dsom_jax.data.log import RawLog, Report
 from dsom_jax.data.log_options import AS_TOLD, LogOptions, option
+from dsom_jax.data.ros2_messages import ODOMETRY, SCAN, TF
 from dsom_jax.data.scans import Scans, table
 from dsom_jax.data.tf_tree import FIXED, TfTree, last_name, pose_row, stamp_of
 from dsom_jax.errors import UserError
 
-SCAN, ODOMETRY = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Odometry"
 ECHOES, CLOUD = "sensor_msgs/msg/MultiEchoLaserScan", "sensor_msgs/msg/PointCloud2"
-TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+_TF = (TF, "tf/msg/tfMessage")
 """The second is the name of the same message in bags from before 2013."""
 
 
@@ -139,7 +139,7 @@ def _odometry_topic(
 def _read(reader: Any, chosen: tuple[str, str | None, str | None], report: Report) -> BagMessages:
     """The messages of the topics chosen (scans, odometry, reference), and the transforms of the scans' robot."""
     scan_topic, odom_topic, reference_topic = chosen
-    transforms = [c for c in reader.connections if c.msgtype in TF]
+    transforms = [c for c in reader.connections if c.msgtype in _TF]
     # nav2 gives each robot its own /robot1/tf.
     own = [c for c in transforms if _namespace(c.topic) == _namespace(scan_topic)]
     transforms = own if len({_namespace(c.topic) for c in transforms}) > 1 and own else transforms

@@ -16,7 +16,7 @@ from dsom_jax.errors import UserError
 from dsom_jax.occupancy import OccupancyGrid, from_cells
 
 GRID = "nav_msgs/msg/OccupancyGrid"
-OCCUPIED, FREE = 65, 25
+_OCCUPIED, _FREE = 65, 25
 """Percent from which on a cell is occupied and up to which it is free: what map_saver writes for the same message."""
 
 
@@ -31,13 +31,13 @@ def load_bag_map(path: Path, report: Report | None = None) -> OccupancyGrid:
         size = f"{info.width} x {info.height} cells of {info.resolution:g} m with {cells.size} values"
         raise UserError(f"{path}: topic {topic}: no map: {size}; record it again")
     cells = cells.reshape(info.height, info.width)
-    free = (cells >= 0) & (cells <= FREE)
+    free = (cells >= 0) & (cells <= _FREE)
     if not free.any():
         raise UserError(f"{path}: topic {topic}: the map has no free cell; record it again when it is built")
     origin = planar(info.origin.position, info.origin.orientation)
     check_near(path, origin[:2], "record it in a nearer frame")
     return from_cells(
-        jnp.asarray(cells >= OCCUPIED), jnp.asarray(free), resolution=float(info.resolution), origin=origin
+        jnp.asarray(cells >= _OCCUPIED), jnp.asarray(free), resolution=float(info.resolution), origin=origin
     )
 
 

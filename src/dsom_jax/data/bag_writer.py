@@ -11,12 +11,11 @@ from typing import Any
 import numpy as np
 
 from dsom_jax.data.log import RawLog
-from dsom_jax.data.ros2_messages import BASE, LASER, ODOM, MessageMaker
+from dsom_jax.data.ros2_messages import BASE, LASER, ODOM, ODOMETRY, SCAN, TF, MessageMaker
 from dsom_jax.errors import UserError
 
 Say = Callable[[str, float, Any], None]
 """Called with a topic, a stamp in seconds and a message."""
-TF, SCAN, ODOMETRY = "tf2_msgs/msg/TFMessage", "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Odometry"
 
 
 def write_bag(path: Path, log: RawLog, moving_frames: bool = False) -> None:

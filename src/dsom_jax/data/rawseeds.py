@@ -35,10 +35,10 @@ from dsom_jax.errors import UserError
 
 MOUNTS = {"FRONT": (0.08, 0.0, 0.0), "REAR": (-0.463, 0.001, math.pi)}
 """Poses of the two lasers on the base: "Calibration 04" in launch/transforms_biccoca.launch of ``rawseds_ros``."""
-NO_RETURN = 81.825
+_NO_RETURN = 81.825
 """Metres: a SICK that counts centimetres writes 81.83 to 81.91 where it has seen nothing."""
 _SUFFIXES = (".csv", ".csv.bz2", ".csv.gz")
-ODOMETRY, GROUND_TRUTH = "-ODOMETRY_XYT", ("-GT-extended", "-GROUNDTRUTH")
+_ODOMETRY, GROUND_TRUTH = "-ODOMETRY_XYT", ("-GT-extended", "-GROUNDTRUTH")
 _MAX_GAP = 2.0
 """Seconds between poses of the ground truth that are bridged: GT-extended has one for each half metre."""
 
@@ -61,7 +61,7 @@ def load_rawseeds(path: str | Path, options: LogOptions = AS_TOLD, range_max: fl
     session, laser = path.name.rsplit("-SICK_", 1)
     pose = np.array(MOUNTS[laser.split(".")[0].upper()], float)
     lidar = options.mounted(lidar_of(path, ranges, config, {}, pose, range_max))
-    odometry = _rows(_sibling(path, session, ODOMETRY), 7, (0, 4, 5, 6), report)
+    odometry = _rows(_sibling(path, session, _ODOMETRY), 7, (0, 4, 5, 6), report)
     poses, broken = odometry_at(facing_forward(odometry, report), stamps, report)
     reference = _reference(path, session, stamps, report)
     ranges = limit_ranges(ranges, lidar.range_min, lidar.range_max)
@@ -133,7 +133,7 @@ def _scans(path: Path, report: Report) -> tuple[np.ndarray, np.ndarray, LaserCon
     ranges = np.stack([scan for scan, kept in zip(scans, keep, strict=True) if kept])
     guess = guess_config(ranges.shape[1])
     start = guess.start_angle + math.radians(np.array(offsets)[keep][0] / 4)
-    return np.array(stamps)[keep], ranges, LaserConfig(start, guess.resolution, NO_RETURN)
+    return np.array(stamps)[keep], ranges, LaserConfig(start, guess.resolution, _NO_RETURN)
 
 
 def _usual(offsets: np.ndarray, report: Report) -> np.ndarray:

@@ -11,6 +11,8 @@ from dsom_jax.lidar import LidarConfig
 from dsom_jax.occupancy import OccupancyGrid
 
 BASE, LASER, ODOM, MAP = "base_link", "laser", "odom", "map"
+TF, SCAN, ODOMETRY = "tf2_msgs/msg/TFMessage", "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Odometry"
+"""Types of messages."""
 OCCUPIED, FREE, UNKNOWN = 100, 0, -1
 """Of nav_msgs/OccupancyGrid, as map_server publishes them."""
 
@@ -54,7 +56,7 @@ class MessageMaker:
         stamped = self._make(
             "geometry_msgs/msg/TransformStamped", header=header, child_frame_id=child, transform=transform
         )
-        return self._make("tf2_msgs/msg/TFMessage", transforms=[stamped])
+        return self._make(TF, transforms=[stamped])
 
     def mount(self, stamp: float, lidar: LidarConfig) -> Any:
         """TFMessage: where the lidar sits on the base."""
@@ -65,7 +67,7 @@ class MessageMaker:
         still = self._make("geometry_msgs/msg/Twist", linear=self._vector(), angular=self._vector())
         zeros = np.zeros(36)
         return self._make(
-            "nav_msgs/msg/Odometry", header=self._header(stamp, ODOM), child_frame_id=BASE,
+            ODOMETRY, header=self._header(stamp, ODOM), child_frame_id=BASE,
             pose=self._make("geometry_msgs/msg/PoseWithCovariance", pose=self._pose(pose), covariance=zeros),
             twist=self._make("geometry_msgs/msg/TwistWithCovariance", twist=still, covariance=zeros),
         )  # fmt: skip
@@ -73,7 +75,7 @@ class MessageMaker:
     def scan(self, stamp: float, ranges: np.ndarray, lidar: LidarConfig) -> Any:
         """LaserScan: ranges (B,) metres, REP-117."""
         return self._make(
-            "sensor_msgs/msg/LaserScan", header=self._header(stamp, LASER), angle_min=lidar.angle_min,
+            SCAN, header=self._header(stamp, LASER), angle_min=lidar.angle_min,
             angle_max=lidar.angle_min + lidar.angle_increment * (lidar.beams - 1),
             angle_increment=lidar.angle_increment, time_increment=0.0, scan_time=0.1, range_min=lidar.range_min,
             range_max=lidar.range_max, ranges=np.asarray(ranges, np.float32), intensities=np.zeros(0, np.float32),

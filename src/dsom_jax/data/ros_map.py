@@ -35,7 +35,7 @@ FORMATS = ("PPM", "PNG", "BMP", "JPEG", "GIF", "TIFF", "WEBP")
 """Pictures that are read, as Pillow calls them; PPM is pgm as well."""
 TRUTHS: dict[Any, bool] = {0: False, 1: True, "no": False, "yes": True, "off": False, "on": True}
 """What map_server takes for ``negate``."""
-UNKNOWN = -1
+_UNKNOWN = -1
 GREY = 205
 """Of unknown pixels, as map_saver writes them: just above 0.196 in occupancy."""
 BLOCK = 1 << 22
@@ -191,7 +191,7 @@ def occupancy_percent(picture: Picture, info: MapInfo) -> np.ndarray:
     for rows in _blocks(picture.pixels):
         percent[rows] = of_level[picture.pixels[rows]]
     if picture.opaque is not None and info.mode != "raw":
-        percent[~picture.opaque] = UNKNOWN
+        percent[~picture.opaque] = _UNKNOWN
     return percent
 
 
@@ -199,9 +199,9 @@ def _percent(brightness: np.ndarray, info: MapInfo) -> np.ndarray:
     """Percentages (N,) of levels of brightness (N,) in [0, 1]."""
     if info.mode == "raw":
         value = np.rint(brightness * 255).astype(int)
-        return np.where(value > 100, UNKNOWN, value)
+        return np.where(value > 100, _UNKNOWN, value)
     occupancy = brightness if info.negate else 1.0 - brightness
-    between = np.full(occupancy.shape, UNKNOWN)
+    between = np.full(occupancy.shape, _UNKNOWN)
     span = info.occupied_thresh - info.free_thresh
     if info.mode == "scale" and span:
         between = np.rint((occupancy - info.free_thresh) / span * 100).clip(0, 100).astype(int)

@@ -17,7 +17,7 @@ from dsom_jax.lidar import LidarConfig
 
 _REACH = 20.0
 """Metres; longer readings say little about a step of a metre and cost room in the picture."""
-TURN, SHIFT = 0.95, 1.6
+_TURN, _SHIFT = 0.95, 1.6
 """The coarse search looks this far: radians, metres."""
 CELL = 0.1
 NEIGHBOURS = 7
@@ -76,7 +76,7 @@ class Reference:
 
     def picture(self) -> tuple[np.ndarray, int]:
         """uint8 (S, S) nearness to the scan, 255 on it, and the cell of the sensor."""
-        half = int((_REACH + 2 * SHIFT) / CELL) + 2
+        half = int((_REACH + 2 * _SHIFT) / CELL) + 2
         blank = np.full((2 * half + 1, 2 * half + 1), 255, np.uint8)
         cells = np.floor(self.points / CELL + 0.5).astype(int) + half
         blank[cells[:, 1], cells[:, 0]] = 0
@@ -111,8 +111,8 @@ def coarse(reference: Reference, points: np.ndarray) -> list[np.ndarray]:
     """The two best poses of different turns on the grid of turns and shifts."""
     few = points[np.linspace(0, len(points) - 1, min(len(points), 60)).astype(int)]
     picture, half = reference.picture()
-    turns = np.arange(-TURN, TURN + 1e-9, 0.05)
-    steps = 2 * np.arange(-int(SHIFT / (2 * CELL)), int(SHIFT / (2 * CELL)) + 1)
+    turns = np.arange(-_TURN, _TURN + 1e-9, 0.05)
+    steps = 2 * np.arange(-int(_SHIFT / (2 * CELL)), int(_SHIFT / (2 * CELL)) + 1)
     c, s = np.cos(turns)[:, None], np.sin(turns)[:, None]
     cells = np.stack([c * few[:, 0] - s * few[:, 1], s * few[:, 0] + c * few[:, 1]]) / CELL
     i, j = np.floor(cells[1] + 0.5).astype(np.int32) + half, np.floor(cells[0] + 0.5).astype(np.int32) + half

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from dsom_jax.types import Array
 
-RADIUS = 3
+_RADIUS = 3
 SIGMA = 3.0
 
 
@@ -30,7 +30,7 @@ class Target(NamedTuple):
 def blurred_one_hot(position: Array, size: int, sigma: float = SIGMA) -> Array:
     """One-hot of the cell around ``position`` (...), in cells, blurred over 7 cells with ``sigma``: (..., size)."""
     offset = jnp.arange(size) - jnp.floor(position)[..., None]
-    weights = jnp.where(jnp.abs(offset) <= RADIUS, jnp.exp(-0.5 * (offset / sigma) ** 2), 0.0)
+    weights = jnp.where(jnp.abs(offset) <= _RADIUS, jnp.exp(-0.5 * (offset / sigma) ** 2), 0.0)
     return weights / weights.sum(-1, keepdims=True)
 
 

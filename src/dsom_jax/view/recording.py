@@ -17,8 +17,8 @@ import numpy as np
 from dsom_jax import report
 from dsom_jax.atomic import sync
 from dsom_jax.data.bag_map import GRID
-from dsom_jax.data.bag_writer import SCAN, TF, Say, new_bag
-from dsom_jax.data.ros2_messages import BASE, MAP, MessageMaker
+from dsom_jax.data.bag_writer import Say, new_bag
+from dsom_jax.data.ros2_messages import BASE, MAP, SCAN, TF, MessageMaker
 from dsom_jax.errors import UserError
 from dsom_jax.judging.scores import Drive
 from dsom_jax.lidar import LidarConfig
