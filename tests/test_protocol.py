@@ -29,6 +29,7 @@ from dsom_jax.lidar import LidarConfig
 from dsom_jax.occupancy import from_cells
 from dsom_jax.protocol import adapting, clips, command, reporting, running
 from dsom_jax.protocol.plan import ProtocolPlan, Variant, read_plan, variants
+from dsom_jax.run_folder import load_init, read_fields
 
 ROOT = Path(__file__).resolve().parents[1]
 FILES = ("paper_data/upo.yaml", "paper_data/bicocca.yaml", "real/paper.yaml")
@@ -153,11 +154,11 @@ def test_training_is_called_with_words_that_it_knows(monkeypatch, tmp_path):
     arguments = parse(train.TrainArgs, "python -m dsom_jax.train")
     assert folder == arguments.out == tmp_path / "net-12-min" and arguments.init == start
     assert arguments.maps == (tmp_path / "map.yaml",) and arguments.minutes == 12.0
-    config = train.read_config(arguments.config)
+    config = arguments.read_config(read_fields(arguments.config), "c.yaml")
     assert config.scan.fov_min == config.scan.fov_max == config.model.fov_min == pytest.approx(math.pi)
     assert (config.learning_rate, config.scan.removed, config.maps_share) == (1e-4, (0, 9), 1.0)
     # It continues what is shipped, and takes its scans from the lidar.
-    assert train.load_init(start, config.model) is not None and config.model.misfit(lidar) is None
+    assert load_init(start, config.model) is not None and config.model.misfit(lidar) is None
     assert adapting.adapt(replace(plan, adapt_minutes=0.0), site, start) == start
     monkeypatch.setattr(adapting.subprocess, "run", lambda words: SimpleNamespace(returncode=2))
     with pytest.raises(UserError, match=r"training on map.yaml failed"):
@@ -190,7 +191,7 @@ def test_filters_are_trained_on_with_words_that_their_training_knows(kind, monke
     assert (config.warmup, config.data.removed, config.data.drive.update_min_d) == (2, 9, 0.25)
     # Half a turn in 361 beams, of which the network wants at most 120; all else is the drive's and the network's own.
     assert config.data.lidar == lidar and config.data.beam_step == 4 and config.data.drive.lidar == LidarConfig()
-    assert config.model.misfit(lidar) is None and train.load_init(start, config.model, kind) is not None
+    assert config.model.misfit(lidar) is None and load_init(start, config.model, kind) is not None
     assert checkpoint.load(start, kind=kind).config.misfit(lidar) is not None
     assert adapting.adapt_filter(replace(plan, learn_steps=0), site, start, kind) == start
 

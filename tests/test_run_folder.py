@@ -20,8 +20,8 @@ from dsom_jax.errors import UserError, run_cli
 from dsom_jax.nn import DSOMConfig, create
 from dsom_jax.run_folder import LOCK, OWNER, Run, check_new, trim_log
 from dsom_jax.run_folder import create_run as begin
-from dsom_jax.train import TrainArgs, open_run
-from dsom_jax.trainer import Parts, train
+from dsom_jax.train import TrainArgs
+from dsom_jax.trainer import Parts, open_run, train
 from dsom_jax.training.loop import TrainConfig
 
 NETWORK = create(DSOMConfig(width=2, headings=4), 0)
@@ -76,10 +76,10 @@ def parts(first: int = 0, at=lambda step: None) -> Parts:
 
 HOLDER = """
 import sys, pathlib
-from dsom_jax.run_folder import Run, create
+from dsom_jax.run_folder import Run, create_run
 from dsom_jax.training.loop import TrainConfig
 run = Run(pathlib.Path(sys.argv[1]), TrainConfig(), (), 9)
-create(run)
+create_run(run)
 print("held", flush=True)
 sys.stdin.read()
 """

@@ -16,7 +16,9 @@ import pytest
 
 from dsom_jax import checkpoint
 from dsom_jax.errors import UserError
-from dsom_jax.train import TrainArgs, open_run, read_config
+from dsom_jax.run_folder import read_fields
+from dsom_jax.train import TrainArgs
+from dsom_jax.trainer import open_run
 
 CONFIG = """
 model: {width: 2, headings: 4}
@@ -109,7 +111,7 @@ def test_bad_input_is_one_line_and_exit_code_2(files):
 def test_bad_configurations(tmp_path, text, message):
     (tmp_path / "c.yaml").write_text(text)
     with pytest.raises(UserError, match=message):
-        read_config(tmp_path / "c.yaml")
+        TrainArgs().read_config(read_fields(tmp_path / "c.yaml"), "c.yaml")
 
 
 def test_bad_arguments(tmp_path):

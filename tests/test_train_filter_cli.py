@@ -22,6 +22,10 @@ from dsom_jax import checkpoint, train_filter
 from dsom_jax.errors import UserError, run_cli
 from dsom_jax.judging import tracking
 from dsom_jax.nn import create_pfrnn
+from dsom_jax.run_folder import FilterRun, create_run
+from dsom_jax.train_filter import TrainFilterArgs
+from dsom_jax.trainer import first_state, open_run
+from dsom_jax.training.filter_loop import init_filter_state
 from dsom_jax.training.sequences import Window
 from learned_kit import training
 
@@ -56,11 +60,11 @@ def weights(folder: Path) -> bytes:
 
 
 def test_a_run_that_lost_its_end_resumes_bit_for_bit(files, monkeypatch):
-    made, parts = [], train_filter.parts
+    made, parts = [], train_filter.filter_parts
 
     def compiled_once(run, material):
         made.append(made[0] if made else parts(run, material))
-        return made[0]._replace(state=train_filter.first_state(run, material.network))
+        return made[0]._replace(state=first_state(run, init_filter_state(run.config, material.network)))
 
     def blank_windows(key, pool, config, resolution, count, strays):
         """Robots that stand at the start of their paths and see nothing: no scans to compile."""
@@ -68,7 +72,7 @@ def test_a_run_that_lost_its_end_resumes_bit_for_bit(files, monkeypatch):
         blank = jnp.full((count, config.window, config.lidar.beams), jnp.inf)
         return Window(pool.where[:count], blank, jnp.zeros_like(poses), poses, jnp.zeros((count, strays, 3)))
 
-    monkeypatch.setattr(train_filter, "parts", compiled_once)
+    monkeypatch.setattr(train_filter, "filter_parts", compiled_once)
     monkeypatch.setattr(tracking, "make_windows", blank_windows)
     command(files, monkeypatch, "run")
     whole, log = weights(files / "run"), (files / "run" / "metrics.jsonl").read_text()
@@ -87,22 +91,20 @@ def test_a_run_that_lost_its_end_resumes_bit_for_bit(files, monkeypatch):
 
 def test_a_run_begins_with_the_weights_that_are_named(files, capsys):
     begin = files / "begin"
-    given = train_filter.TrainFilterArgs(
-        "pfrnn", files / "tiny.yaml", (files / "map.yaml",), out=files / "more", resume=True
-    )
+    given = TrainFilterArgs("pfrnn", files / "tiny.yaml", (files / "map.yaml",), out=files / "more", resume=True)
     config = given.read_config(yaml.safe_load((files / "tiny.yaml").read_text()), "tiny.yaml")
     network = create_pfrnn(config.model, 7)
     checkpoint.save(begin, network, {})
-    run, material = train_filter.open_run(replace(given, init=begin))
-    state = train_filter.first_state(run, material.network)
+    run, material = open_run(replace(given, init=begin))
+    state = first_state(run, init_filter_state(run.config, material.network))
     for part in (state.params, state.average):
         chex.assert_trees_all_equal(part, nnx.as_pure(nnx.split(network)[1]))
     with pytest.raises(UserError, match="give --init, too"):
-        train_filter.open_run(given)
+        open_run(given)
     with pytest.raises(UserError, match="began with begin"):
-        train_filter.open_run(replace(given, init=files))
+        open_run(replace(given, init=files))
     run.save(state, {})
-    assert train_filter.open_run(replace(given, init=begin))[1].network is None
+    assert open_run(replace(given, init=begin))[1].network is None
     assert "not read, the run goes on" in capsys.readouterr().out
 
 
@@ -133,25 +135,24 @@ def test_bad_input_is_one_line_and_exit_code_2(files, monkeypatch, capsys, words
 )  # fmt: skip
 def test_bad_configurations(tmp_path, text, message):
     with pytest.raises(UserError, match=message):
-        train_filter.TrainFilterArgs("pf_net").read_config(yaml.safe_load(text), "c.yaml")
+        TrainFilterArgs("pf_net").read_config(yaml.safe_load(text), "c.yaml")
 
 
 def test_scans_that_the_network_would_refuse_are_not_trained_on(files, tmp_path):
     config = yaml.safe_load((files / "tiny.yaml").read_text())
     config["data"]["lidar"] |= {"beams": 16, "angle_min": -1.5}
     (tmp_path / "half.yaml").write_text(yaml.safe_dump(config))
-    given = train_filter.TrainFilterArgs("pfrnn", tmp_path / "half.yaml", (files / "map.yaml",), out=tmp_path / "never")
+    given = TrainFilterArgs("pfrnn", tmp_path / "half.yaml", (files / "map.yaml",), out=tmp_path / "never")
     with pytest.raises(UserError, match=r"half.yaml: data.lidar: field of view 180 deg, trained for 360"):
-        train_filter.open_run(given)
+        open_run(given)
     assert not given.folder.exists()
 
 
 def test_a_run_of_another_filter_is_not_resumed(tmp_path):
-    create = train_filter.FilterRun(tmp_path, training("pfrnn"), (), 3)
-    train_filter.create_run(create)
+    create_run(FilterRun(tmp_path, training("pfrnn"), (), 3))
     with pytest.raises(UserError, match="unknown field"):
-        train_filter.open_run(train_filter.TrainFilterArgs("pf_net", out=tmp_path, resume=True))
+        open_run(TrainFilterArgs("pf_net", out=tmp_path, resume=True))
     with pytest.raises(UserError, match="not empty"):
-        train_filter.open_run(train_filter.TrainFilterArgs("pfrnn", out=tmp_path))
+        open_run(TrainFilterArgs("pfrnn", out=tmp_path))
     with pytest.raises(UserError, match="--steps 5"):
-        train_filter.open_run(train_filter.TrainFilterArgs("pfrnn", out=tmp_path, resume=True, steps=5))
+        open_run(TrainFilterArgs("pfrnn", out=tmp_path, resume=True, steps=5))

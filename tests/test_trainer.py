@@ -12,8 +12,8 @@ import pytest
 from dsom_jax import checkpoint
 from dsom_jax.errors import UserError
 from dsom_jax.run_folder import Run, create_run
-from dsom_jax.train import TrainArgs, open_run
-from dsom_jax.trainer import CALIBRATION_STEPS, Parts, Trainer, train
+from dsom_jax.train import TrainArgs
+from dsom_jax.trainer import CALIBRATION_STEPS, Parts, Trainer, open_run, train
 from dsom_jax.training.loop import TrainConfig
 
 

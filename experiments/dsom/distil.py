@@ -22,8 +22,8 @@ from dsom_jax.cli import parse
 from dsom_jax.errors import UserError, run_cli
 from dsom_jax.nn import DSOM, create
 from dsom_jax.nn.dsom import MapFeatures
-from dsom_jax.train import Material, TrainArgs, open_run, parts
-from dsom_jax.trainer import train
+from dsom_jax.train import TrainArgs, dsom_parts
+from dsom_jax.trainer import Material, open_run, train
 from dsom_jax.training.batches import Batch
 from dsom_jax.training.loop import TrainConfig, make_step, split_model
 from dsom_jax.training.loss import PLACE_AXES, similarity_loss
@@ -118,7 +118,8 @@ def main() -> None:
     # As `--init` does, a run that has saved a state goes on from that.
     first = None if run.states() else begun(create(run.config.model, run.config.seed), teacher)
     step = make_step(run.config, partial(losses, teacher=teacher))
-    train(args, run, lambda: parts(run, Material(material.grids, first))._replace(step=step, shown=("likeness", "r")))
+    begun_with = Material(material.grids, first)
+    train(args, run, lambda: dsom_parts(run, begun_with)._replace(step=step, shown=("likeness", "r")))
 
 
 if __name__ == "__main__":

@@ -32,8 +32,8 @@ from dsom_jax import checkpoint
 from dsom_jax.errors import run_cli
 from dsom_jax.nn import DSOMConfig, create
 from dsom_jax.run_folder import Run, commit
-from dsom_jax.train import TrainArgs, open_run
-from dsom_jax.trainer import Parts, train
+from dsom_jax.train import TrainArgs
+from dsom_jax.trainer import Parts, open_run, train
 
 RESULTS = Path(__file__).parent / "results"
 FOREIGN = ("weights_backup", "weights", "state-mine", "weights-00000000")

@@ -170,6 +170,9 @@ class Run:
         keep = {path.name for path in self.states()[-2:]} | {tag}
         claim.discard(claim.wrote - keep)
 
+    def check(self, path: Path | None) -> None:
+        """UserError for a configuration, that of ``path``, with which no run should begin."""
+
     def model(self, state: Any) -> Any:
         """The network that is shipped."""
         return averaged_model(self.config, state)
@@ -201,6 +204,11 @@ class Run:
 @dataclass
 class FilterRun(Run):
     """A training run of PF-Net or PFRNN; without ``maps``, on the test maps of the frozen suite."""
+
+    def check(self, path: Path | None) -> None:
+        """UserError if the network would refuse the scans that it is to be trained on."""
+        if unfit := self.config.model.misfit(self.config.data.lidar):
+            raise UserError(f"{path}: data.lidar: {unfit}; give model: view: what these scans have")
 
     def model(self, state: Any) -> Any:
         """The network that is shipped."""

@@ -5,21 +5,20 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 
-from dsom_jax import checkpoint
 from dsom_jax.cli import parse
 from dsom_jax.data.open_map import load_maps
 from dsom_jax.data.suite import load_suite
-from dsom_jax.errors import UserError, run_cli
+from dsom_jax.errors import run_cli
 from dsom_jax.judging.tracking import make_tracking
 from dsom_jax.nn import KINDS
 from dsom_jax.occupancy import OccupancyGrid
-from dsom_jax.run_folder import FilterRun, Run, check_init, check_new, create_run, load_init, read_fields, reopen
-from dsom_jax.trainer import Parts, check_length, train
+from dsom_jax.run_folder import Run
+from dsom_jax.trainer import Material, Parts, check_length, first_state, open_run, train
 from dsom_jax.training.filter_loop import FilterTrainConfig, init_filter_state, make_filter_step, stack_maps
 from dsom_jax.training.memory import keep_freed_memory
 from dsom_jax.training.options import override
@@ -62,64 +61,20 @@ class TrainFilterArgs:
         """Where the run lives."""
         return self.out or Path("runs") / self.filter.replace("_", "-")
 
+    @property
+    def kind(self) -> str:
+        """Of the network."""
+        return self.filter
+
     def read_config(self, given: Any, where: str) -> FilterTrainConfig:
         """The configuration of this filter with the fields of ``given``."""
         return override(FilterTrainConfig(model=KINDS[self.filter].config()), given, where)
 
-
-def training_maps(paths: tuple[str, ...], resolution: float) -> list[OccupancyGrid]:
-    """Maps at the network's resolution, their frames at their lower-left corners."""
-    if paths:
-        return load_maps(tuple(Path(path) for path in paths), resolution)
-    tests = {name: grid for name, grid, _ in load_suite("synthetic-v1").episodes}
-    return list(tests.values())
-
-
-class Material(NamedTuple):
-    """What a run reads before it begins: maps at the network's resolution, and the network to start from, if any."""
-
-    grids: list[OccupancyGrid]
-    network: Any
-
-
-def open_run(args: TrainFilterArgs) -> tuple[FilterRun, Material]:
-    """A new run in an empty folder, or the one to resume, and what it is made of."""
-    path, out = args.folder / "run.json", args.folder
-    if args.resume and path.exists():
-        run = resume_run(args, path)
-        return run, read_material(args, run)
-    check_new(out)
-    config = args.read_config(read_fields(args.config), str(args.config))
-    if unfit := config.model.misfit(config.data.lidar):
-        raise UserError(f"{args.config}: data.lidar: {unfit}; give model: view: what these scans have")
-    begin = None if args.init is None else args.init.name
-    run = FilterRun(out, config, tuple(str(p) for p in args.maps), args.steps, init=begin)
-    # Before anything is written: a bad map or checkpoint leaves no folder behind.
-    material = read_material(args, run)
-    create_run(run)
-    return run, material
-
-
-def read_material(args: TrainFilterArgs, run: FilterRun) -> Material:
-    """Maps and network; a run that has saved a state no longer needs the network that it began with."""
-    network = None if run.states() else load_init(args.init, run.config.model, args.filter)
-    return Material(training_maps(run.maps, run.config.model.resolution), network)
-
-
-def resume_run(args: TrainFilterArgs, path: Path) -> FilterRun:
-    """The run described by run.json; UserError if it is of another filter or configuration."""
-    run = reopen(FilterRun, path, lambda given: args.read_config(given, str(path)), args.maps, args.steps)
-    if args.config is not None and args.read_config(read_fields(args.config), str(args.config)) != run.config:
-        raise UserError(f"{args.config}: differs from the run in {path}; resume without --config")
-    check_init(args.init, run, path)
-    return run
-
-
-def first_state(run: Run, network: Any) -> Any:
-    """The newest saved state, or a fresh one."""
-    fresh = init_filter_state(run.config, network)
-    saved = run.newest(lambda path: checkpoint.load_state(path, fresh))
-    return fresh if saved is None else saved
+    def read_maps(self, run: Run) -> list[OccupancyGrid]:
+        """Maps of ``run`` at the network's resolution, their frames at their lower-left corners."""
+        if run.maps:
+            return load_maps(tuple(map(Path, run.maps)), run.config.model.resolution)
+        return list({name: grid for name, grid, _ in load_suite("synthetic-v1").episodes}.values())
 
 
 def _make_batches(run: Run, grids: list[OccupancyGrid]) -> tuple[Callable[[int, int], Any], Any]:
@@ -135,12 +90,13 @@ def _make_batches(run: Run, grids: list[OccupancyGrid]) -> tuple[Callable[[int, 
     return lambda step, total: batch(jnp.int32(step)), stack_maps(pool, resolution)
 
 
-def parts(run: Run, material: Material) -> Parts:
+def filter_parts(run: Run, material: Material) -> Parts:
     """Batches, step and evaluation of a run."""
     grids = [replace(grid, origin=jnp.zeros(3)) for grid in material.grids]
     batches, places = _make_batches(run, grids)
     step, evaluate = make_filter_step(run.config, places), make_tracking(run.config, grids)
-    return Parts(batches, step, evaluate, first_state(run, material.network), ("prediction", "prediction"))
+    state = first_state(run, init_filter_state(run.config, material.network))
+    return Parts(batches, step, evaluate, state, ("prediction", "prediction"))
 
 
 def main() -> None:
@@ -148,7 +104,7 @@ def main() -> None:
     args = parse(TrainFilterArgs, "python -m dsom_jax.train_filter")
     keep_freed_memory()
     run, material = open_run(args)
-    train(args, run, lambda: parts(run, material))
+    train(args, run, lambda: filter_parts(run, material))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The loop around a jitted training step: progress, the clock, checkpoints; the same for every network."""
+"""A training run from its folder to its end: what it begins with, and the loop around its jitted step."""
 
 from __future__ import annotations
 
@@ -16,31 +16,59 @@ from typing import Any, NamedTuple, Protocol
 import jax.numpy as jnp
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from dsom_jax import checkpoint
 from dsom_jax.atomic import write_atomic
 from dsom_jax.errors import UserError
-from dsom_jax.run_folder import OWNER, Run, trim_log
+from dsom_jax.occupancy import OccupancyGrid
+from dsom_jax.run_folder import (
+    OWNER,
+    RUN,
+    FilterRun,
+    Run,
+    check_init,
+    check_new,
+    create_run,
+    load_init,
+    read_fields,
+    reopen,
+    trim_log,
+)
 
 CALIBRATION_STEPS = 30
 
 
+class Material(NamedTuple):
+    """What a run reads before it begins: maps at the network's resolution, and the network to start from, if any."""
+
+    grids: list[OccupancyGrid]
+    network: Any
+
+
 class Options(Protocol):
-    """Those arguments of a training command that the loop looks at."""
+    """The arguments of a training command, and what only they know of its network."""
 
     @property
-    def steps(self) -> int | None:
-        """Number of steps, in place of minutes."""
-
+    def config(self) -> Path | None: ...
     @property
-    def minutes(self) -> float:
-        """Time to train; the number of steps is set after the first few."""
-
+    def maps(self) -> tuple[Path, ...]: ...
     @property
-    def save_minutes(self) -> float:
-        """Time between checkpoints."""
-
+    def init(self) -> Path | None: ...
     @property
-    def save_steps(self) -> int | None:
-        """Steps between checkpoints, in place of save_minutes."""
+    def minutes(self) -> float: ...
+    @property
+    def steps(self) -> int | None: ...
+    @property
+    def resume(self) -> bool: ...
+    @property
+    def save_minutes(self) -> float: ...
+    @property
+    def save_steps(self) -> int | None: ...
+    @property
+    def folder(self) -> Path: ...
+    @property
+    def kind(self) -> str: ...
+    def read_config(self, given: Any, where: str) -> Any: ...
+    def read_maps(self, run: Run) -> list[OccupancyGrid]: ...
 
 
 class Parts(NamedTuple):
@@ -71,6 +99,41 @@ def check_length(options: Options) -> None:
         raise UserError(f"--save-minutes {options.save_minutes}: give a positive time")
     if options.save_steps is not None and options.save_steps < 1:
         raise UserError(f"--save-steps {options.save_steps}: give at least one step")
+
+
+def open_run(args: Options) -> tuple[Run, Material]:
+    """A new run in an empty folder, or the one to resume, and what it is made of.
+
+    UserError for a run to resume of another network or configuration.
+    """
+    path, kind = args.folder / RUN, Run if args.kind == "dsom" else FilterRun
+    if args.resume and path.exists():
+        run = reopen(kind, path, lambda given: args.read_config(given, str(path)), args.maps, args.steps)
+        if args.config is not None and args.read_config(read_fields(args.config), str(args.config)) != run.config:
+            raise UserError(f"{args.config}: differs from the run in {path}; resume without --config")
+        check_init(args.init, run, path)
+        return run, read_material(args, run)
+    check_new(args.folder)
+    config = args.read_config(read_fields(args.config), str(args.config))
+    begin = None if args.init is None else args.init.name
+    run = kind(args.folder, config, tuple(map(str, args.maps)), args.steps, init=begin)
+    run.check(args.config)
+    # Before anything is written: a bad map or checkpoint leaves no folder behind.
+    material = read_material(args, run)
+    create_run(run)
+    return run, material
+
+
+def read_material(args: Options, run: Run) -> Material:
+    """Maps and network; a run that has saved a state no longer needs the network that it began with."""
+    network = None if run.states() else load_init(args.init, run.config.model, args.kind)
+    return Material(args.read_maps(run), network)
+
+
+def first_state(run: Run, fresh: Any) -> Any:
+    """The newest saved state, or the ``fresh`` one."""
+    saved = run.newest(lambda path: checkpoint.load_state(path, fresh))
+    return fresh if saved is None else saved
 
 
 def train(options: Options, run: Run, make: Callable[[], Parts]) -> dict[str, Any]:
