@@ -24,8 +24,22 @@ LAYERS = (
     ("proposals",),
     ("belief",),
     ("filters", "training", "montecarlo", "ambiguity"),
-    ("atomic", "cache", "data", "checkpoint", "run_folder", "trained", "plotting", "report", "summary_table", "judging",
-     "view", "maps", "logs", "diagnosis"),
+    (
+        "atomic",
+        "cache",
+        "data",
+        "checkpoint",
+        "run_folder",
+        "trained",
+        "plotting",
+        "report",
+        "summary_table",
+        "judging",
+        "view",
+        "maps",
+        "logs",
+        "diagnosis",
+    ),
     ("live",),
     (
         "__main__",
@@ -143,6 +157,54 @@ def test_no_import_cycles():
 
     for module in graph:
         visit(module, ())
+
+
+TWICE = {
+    "main": "every command has one",
+    **dict.fromkeys(("certify", "inspect", "localize", "train"), "a command in __main__.py, and what it does"),
+    **dict.fromkeys(("compose", "relative", "inverse"), "for NumPy in data/se2.py, for JAX in geometry.py"),
+    "Draw": "new particles; what they carry beside their poses is each filter's own",
+    "start": "a filter before its first update, of one run or of all",
+}
+"""Public names that may stand in several modules, and why: they are one thing."""
+
+
+def public_names(source: str) -> set[str]:
+    """Functions, classes and constants that a module defines for others."""
+    found: set[str] = set()
+    for node in ast.parse(source).body:
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            found.add(node.name)
+        elif isinstance(node, ast.Assign | ast.AnnAssign):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            names = (node for target in targets for node in ast.walk(target) if isinstance(node, ast.Name))
+            found |= {name.id for name in names if isinstance(name.ctx, ast.Store)}
+    return {name for name in found if not name.startswith("_")}
+
+
+def defined_twice(sources: dict[str, str]) -> dict[str, list[str]]:
+    """Public names that several modules define -> those modules."""
+    where: dict[str, list[str]] = {}
+    for module, source in sources.items():
+        for name in public_names(source):
+            where.setdefault(name, []).append(module)
+    return {name: modules for name, modules in where.items() if len(modules) > 1}
+
+
+def test_a_public_name_means_one_thing():
+    twice = defined_twice({module_name(path): path.read_text() for path in MODULES})
+    assert {name: modules for name, modules in twice.items() if name not in TWICE} == {}
+    assert set(TWICE) <= set(twice), "take out of TWICE what stands in one module by now"
+
+
+@pytest.mark.parametrize("line", ["def f(): ...", "class f: ...", "f = 1", "f: int = 1", "f, g = 1, 2"])
+def test_a_name_defined_twice_is_seen(line):
+    assert defined_twice({"a": line, "b": "def f(): ..."}) == {"f": ["a", "b"]}
+
+
+@pytest.mark.parametrize("line", ["from b import f", "_f = 1", "x.f = 1", "f[0] = 1", "def g():\n    f = 1"])
+def test_a_name_defined_once_is_passed_over(line):
+    assert defined_twice({"a": line, "b": "def f(): ..."}) == {}
 
 
 @pytest.mark.parametrize(
