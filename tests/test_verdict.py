@@ -70,7 +70,7 @@ def test_a_perfect_answer_shows_no_sign():
         assert float(value) < {"crab": 0.08, "fresh": 0.051}.get(name, 0.02), name
 
 
-def test_nothing_is_believed_before_the_robot_has_driven():
+def test_little_is_believed_before_the_robot_has_driven():
     watcher = monitor(tiny_world.tables(), tiny_world.LIDAR)
     scan = jnp.full(tiny_world.LIDAR.beams, jnp.nan)
     step, zero = jax.jit(watcher.watch), jnp.float32(0.0)
@@ -80,7 +80,8 @@ def test_nothing_is_believed_before_the_robot_has_driven():
         odometry = jnp.array([travel, 0.0, 0.5])
         track, signs = step(track, pose, scan, odometry, jnp.bool_(t == 0), zero, zero)
         fresh.append(float(signs.fresh))
-    np.testing.assert_allclose(fresh, [1, 1, 1, math.exp(-2)], rtol=1e-5)
+    turned = np.array([0.0, 0.03, 0.06, 0.09])  # 0.06 m for each radian
+    np.testing.assert_allclose(fresh, np.exp(-(turned + np.array([0, 0, 0, 0.9])) / 0.45), rtol=1e-5)
     told = step(watcher.start(jnp.zeros(3)), jnp.zeros(3), scan, jnp.zeros(3), jnp.bool_(False), zero, zero)
     assert float(told[1].fresh) == 0.0
 

@@ -17,7 +17,9 @@ from dsom_jax.raycast import MapTables, cast_rays
 from dsom_jax.types import Array
 
 _UNTRIED = 0.45
-"""Metres that leave a third of the doubt of the start: turning alone does not show how a lidar is mounted."""
+"""Metres that leave a third of the doubt of the start: what a lidar sees at a stand does not show how it is mounted."""
+_SPUN = 0.06
+"""Metres that a radian counts for: a robot may have to be sure before it drives, so one turn on the spot will do."""
 _MINUTES = 0.97
 """Share of the past that an update keeps of the way driven backwards."""
 _TOLERANCE = 0.3
@@ -73,7 +75,7 @@ class Track(NamedTuple):
         cross, along, squared: () faded sums of reported x answered steps: crosswise, along, and of the reported ones;
             a step that was answered backwards counts as one forth, as some encoders do not tell the two apart.
         back, path: () metres answered backwards, and all, in the last minutes.
-        driven: () metres reported since the start.
+        driven: () metres reported since the start, and a little for what was turned.
         slide, turn: () faded sums of squared gaps between reported and answered steps (m^2) and turns (rad^2).
         steps: () faded number of steps.
         jump: () faded number of steps that no odometry explains.
@@ -203,7 +205,7 @@ class Monitor:
             squared=keep * track.squared + use * travel**2,
             back=long * track.back + use * travel * backward,
             path=long * track.path + use * travel,
-            driven=jnp.where(first, 0.0, track.driven + travel),
+            driven=jnp.where(first, 0.0, track.driven + travel + _SPUN * jnp.abs(odometry[2])),
             slide=keep * track.slide + use * jnp.where(use > 0, off, 0.0) ** 2,
             turn=keep * track.turn + use * gap**2,
             steps=keep * track.steps + use,
