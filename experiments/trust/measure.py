@@ -47,6 +47,7 @@ from dsom_jax.lidar import LidarConfig
 from dsom_jax.montecarlo import run, run_keys
 from dsom_jax.occupancy import OccupancyGrid, cell_index, lookup
 from dsom_jax.report import write_json, write_text
+from dsom_jax.run_folder import commit
 from dsom_jax.simulate.drive import DriveConfig, make_synthetic
 
 HERE = Path(__file__).parent
@@ -125,7 +126,7 @@ def main() -> None:
             continue
         began = time.perf_counter()
         row, said = measure(case, args.runs)
-        rows[name] = row | {"runs": args.runs}
+        rows[name] = row | {"runs": args.runs, "tree": commit()[:7]}
         rows["all"] = words.add(name, said)
         print(f"{name:44}", {k: v for k, v in rows[name].items() if v is not None},
               f"{time.perf_counter() - began:.0f} s", flush=True)  # fmt: skip
@@ -147,14 +148,14 @@ def table(rows: dict[str, Any]) -> str:
     for scope, good in rows.get("all", {}).items():
         numbers = f"AUROC {good['auroc']:.3f}, ECE {good['ece']:.3f}"
         lines.append(f"- `p_lost` over {scope}, {good['answers']} answers: {numbers}")
-    heads = ("case", "runs", *COLUMNS.values(), "first localized", "error m")
-    lines += ["", "In percent.", "", "| " + " | ".join(heads) + " |"]
-    lines.append("| --- |" + " ---: |" * (len(COLUMNS) + 3))
+    heads = ("case", "tree", "runs", *COLUMNS.values(), "first localized", "error m")
+    lines += ["", "In percent; `first localized` is a median of updates, `tree` the commit that was measured.", "", "| " + " | ".join(heads) + " |"]
+    lines.append("| --- |" + " ---: |" * (len(COLUMNS) + 4))
     for name, row in rows.items():
         if name != "all":
             shares = [f"{100 * row[c]:.1f}" if row[c] is not None else "" for c in COLUMNS]
-            rest = [f"{row['first_localized']:.1f}", "" if row["error"] is None else f"{row['error']:.3f}"]
-            lines.append(f"| {name} | {row['runs']} | " + " | ".join([*shares, *rest]) + " |")
+            rest = ["" if row[c] is None else f"{row[c]:.{n}f}" for c, n in (("first_localized", 1), ("error", 3))]
+            lines.append(f"| {name} | {row['tree']} | {row['runs']} | " + " | ".join([*shares, *rest]) + " |")
     return "\n".join(lines) + "\n"
 
 

@@ -45,10 +45,14 @@ FAULTS = (
     Fault("sensor.py", "jnp.exp(evidence - jnp.where(jnp.isfinite(best), best, 0.0))", "jnp.exp(evidence)", "test_sensor.py"),
     Fault("sensor.py", "euclidean_distance(grid.occupied, cap) * grid.resolution", "euclidean_distance(grid.occupied, cap)", "test_sensor.py"),
     # Resampling
-    Fault("resampling.py", 'side="right", method="scan_unrolled"', 'side="left", method="scan_unrolled"', "test_resampling.py"),
-    Fault("resampling.py", "scaled = jnp.minimum(positions * total, jnp.nextafter(total, jnp.zeros_like(total)))\n    return jnp", "scaled = positions\n    return jnp", "test_resampling.py"),
+    Fault("resampling.py", "width) - 1] <= scaled)", "width) - 1] < scaled)", "test_resampling.py"),
+    Fault("resampling.py", "scaled = jnp.minimum(positions * total, jnp.nextafter(total, jnp.zeros_like(total)))", "scaled = positions * total", "test_resampling.py"),
     Fault("resampling.py", "jnp.arange(n) + jax.random.uniform(key)) / n", "jnp.arange(n) + jax.random.uniform(key, (n,))) / n", "test_resampling.py"),
     Fault("resampling.py", "ratio = log_weights - jnp.log(", "ratio = log_weights + jnp.log(", "test_resampling.py"),
+    # Rays
+    Fault("marching.py", "np.ceil(slopes[1:] * (column + 1) + 1 + _NUDGE)", "np.ceil(slopes[1:] * column + 1)", "test_raycast.py", "wedges"),
+    Fault("marching.py", "first = np.floor(slopes[:-1] * np.maximum(column - 1, 0))", "first = np.floor(slopes[:-1] * (column + 1))", "test_raycast.py", "wedges"),
+    Fault("marching.py", "columns = side - 1.0", "columns = side", "test_raycast.py", "wedges"),
     # Clusters and estimates
     Fault("filters/common.py", "for _ in range(2):", "for _ in range(0):", "test_filters.py", "cluster"),
     Fault("filters/common.py", "candidates[jnp.argmax(mass)]", "candidates[0]", "test_filters.py", "cluster"),
