@@ -149,7 +149,8 @@ def table(rows: dict[str, Any]) -> str:
         numbers = f"AUROC {good['auroc']:.3f}, ECE {good['ece']:.3f}"
         lines.append(f"- `p_lost` over {scope}, {good['answers']} answers: {numbers}")
     heads = ("case", "tree", "runs", *COLUMNS.values(), "first localized", "error m")
-    lines += ["", "In percent; `first localized` is a median of updates, `tree` the commit that was measured.", "", "| " + " | ".join(heads) + " |"]
+    lines += ["", "In percent; `first localized` is a median of updates, `tree` the commit that was measured."]
+    lines += ["", "| " + " | ".join(heads) + " |"]
     lines.append("| --- |" + " ---: |" * (len(COLUMNS) + 4))
     for name, row in rows.items():
         if name != "all":
