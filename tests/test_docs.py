@@ -55,11 +55,11 @@ def arguments(module: str) -> type:
 
 
 def write_map_and_log(folder: Path) -> None:
-    """``map.yaml`` and ``drive.log``: the tiny room, and a robot that turns about; its odometry is in the map frame."""
+    """``map.yaml`` and ``drive.log``: the tiny room, and a robot that turns once; its odometry is in the map frame."""
     dsom_jax.save_ros_map(tiny_world.grid(), folder / "map.yaml")
     # What a reader takes a CARMEN scan of 180 readings for.
     lidar = LidarConfig(beams=180, angle_min=-math.pi / 2, angle_increment=math.pi / 180, range_max=8.0)
-    turns = jnp.stack([jnp.full(13, 3.1), jnp.full(13, 2.3), 0.3 * jnp.arange(13)], axis=-1)
+    turns = jnp.stack([jnp.full(13, 3.1), jnp.full(13, 2.3), 0.6 * jnp.arange(13)], axis=-1)
     poses = tiny_world.grid().from_grid(turns)
     scans = np.minimum(np.asarray(cast_rays(tiny_world.tables(), poses, lidar)), 8.19)
     lines = []

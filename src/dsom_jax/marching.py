@@ -18,7 +18,7 @@ from dsom_jax.occupancy import inside
 from dsom_jax.types import Array
 
 _NUDGE = 1e-3  # cells; larger than float32 rounding at 4,000 cells, smaller than anything a lidar resolves
-_STEPS = (3, 3, 3)
+_STEPS = (3, 2, 2)
 """Leaps that all rays take together, then those still under way, and so on; the last few go on until they arrive."""
 _SHARES = (3, 4, 4)
 """Of so many rays one is taken up at a time, after each of these."""
@@ -182,7 +182,10 @@ def _taken_up(
 
     def some(state: tuple[Array, Array]) -> tuple[Array, Array]:
         reach, live = state
-        where = jnp.flatnonzero(live, size=size, fill_value=count)
+        # What flatnonzero does, in a third of its time and of its compilation.
+        place = jnp.where(live, jnp.cumsum(live, dtype=jnp.int32) - 1, size)
+        number = jnp.arange(count, dtype=jnp.int32)
+        where = jnp.full(size, count, jnp.int32).at[place].set(number, mode="drop")
         chosen = jnp.minimum(where, count - 1)
         ray = take(rays, chosen)
         ahead = jax.lax.optimization_barrier(fan.at(ray))
