@@ -43,7 +43,8 @@ WRONG: dict[type, tuple[dict, dict]] = {
     }),
     LidarNoise: ({}, {"sigma": (-0.1, NAN), "sigma_relative": (-1.0,), "dropout": (1.5, -0.1), "short": (2.0, NAN)}),
     RaycastConfig: ({}, {
-        "method": ("fast",), "angles": (3,), "max_skip": (0, 256), "surface": (-1.0, NAN), "viewpoints": (0, 1.5),
+        "method": ("fast",), "angles": (3,), "max_skip": (0, 256), "wedges": (-1, 1.5), "surface": (-1.0, NAN),
+        "viewpoints": (0, 1.5),
     }),
     ScoreModel: ({}, {
         "sigma": (0.0, NAN), "alpha": (-0.1,), "beta": (-0.1,), "range_max": (0.0, INF), "power": (0, 1.5),

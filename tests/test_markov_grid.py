@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import tiny_world
-from dsom_jax.belief.grid_belief import GridBeliefConfig
+from dsom_jax.belief.grid_memory import GridBeliefConfig
 from dsom_jax.filters.adam import AdamMCL
 from dsom_jax.filters.adam_memory import AdamMemory, AdamPlaces
 from dsom_jax.filters.adam_robust import AdamRobust, RobustConfig, RobustState

@@ -261,6 +261,15 @@ def test_wedges_of_a_bare_hall_by_hand():
     assert ahead[2 * 4, 1, 7] == 1 + 7  # the same to the left
 
 
+def test_wedges_take_no_more_memory_than_allowed(monkeypatch):
+    occupied = jnp.asarray(random_map(1, (30, 30), 0.1))
+    monkeypatch.setattr(raycast, "_MOST", 2 * 8 * 32 * 32)
+    assert raycast.leaps(occupied, RaycastConfig(wedges=5)).shape == (2 * 8, 32, 32)
+    assert raycast.leaps(occupied, RaycastConfig(wedges=1, max_skip=255)).shape == (8, 32, 32)
+    monkeypatch.setattr(raycast, "_MOST", 1)
+    assert raycast.leaps(occupied, RaycastConfig(wedges=5)).shape == (8, 32, 32)
+
+
 def test_table_against_exact(house):
     lidar = LidarConfig(beams=72, angle_increment=2 * math.pi / 72)
     rng = np.random.default_rng(0)

@@ -19,9 +19,9 @@ from dsom_jax.types import Array
 
 _NUDGE = 1e-3  # cells; larger than float32 rounding at 4,000 cells, smaller than anything a lidar resolves
 _STEPS = (3, 2, 2)
-"""Leaps that all rays take together, then those still under way, and so on; the last few go on until they arrive."""
+"""Leaps of a ray when it is taken up, by level; at first all rays take those of the first level, too."""
 _SHARES = (3, 4, 4)
-"""Of so many rays one is taken up at a time, after each of these."""
+"""Of so many rays one is taken up at a time, by level: a third of all, of these a quarter, of these a quarter."""
 _FEW = 1024
 """Rays for which it is not worth while to sort out those that have arrived."""
 
@@ -195,8 +195,7 @@ def _taken_up(
             got = _to_the_end(empty, ahead, limit, got, more)
         else:
             got = _taken_up(empty, fan, limit, ray, got, more, level + 1)
-        done = live.at[where].set(False, mode="drop", unique_indices=True)
-        return reach.at[where].set(got, mode="drop", unique_indices=True), done
+        return reach.at[where].set(got, mode="drop"), live.at[where].set(False, mode="drop")
 
     return jax.lax.while_loop(lambda s: s[1].any(), some, (reach, free))[0]
 

@@ -53,8 +53,8 @@ class RaycastConfig:
         checks.choice(self, "method", ("exact", "table"))
         checks.count(self, "angles", 4)
         checks.count(self, "max_skip viewpoints")
-        checks.within(self, "max_skip", 1, 254, "give 1 to 254 cells")
-        checks.within(self, "wedges", 0, 64, "give 0 to 64 sectors")
+        checks.within(self, "max_skip", 1, 255, "give 1 to 255 cells")
+        checks.count(self, "wedges", 0)
         checks.not_negative(self, "surface")
 
 
@@ -98,11 +98,12 @@ def make_tables(grid: OccupancyGrid, config: RaycastConfig, range_max: float) ->
 
 
 def leaps(occupied: Array, config: RaycastConfig) -> Array:
-    """:attr:`MapTables.empty` of cells (H, W)."""
+    """:attr:`MapTables.empty` of occupied cells (H, W)."""
     bordered = jnp.pad(occupied, 1, constant_values=True)
     if not config.wedges:
         return empty_squares(bordered, config.max_skip)
-    return empty_wedges(bordered, min(config.wedges, max(1, _MOST // (8 * bordered.size))), config.max_skip)
+    sectors = max(1, min(config.wedges, _MOST // (8 * bordered.size)))
+    return empty_wedges(bordered, sectors, min(config.max_skip, 254))
 
 
 def cast_rays(tables: MapTables, poses: Array, lidar: LidarConfig) -> Array:

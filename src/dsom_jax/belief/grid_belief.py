@@ -20,11 +20,12 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from dsom_jax import checks
 from dsom_jax import pose_grid as pg
+from dsom_jax.belief.focus import first_set, reachable
+from dsom_jax.belief.grid_memory import GridBeliefConfig, Memory, Places
 from dsom_jax.belief.moving import moved_everywhere, moved_mass
 from dsom_jax.belief.pool import Pool, draw, even
-from dsom_jax.geometry import compose, rotate
+from dsom_jax.geometry import compose
 from dsom_jax.occupancy import OccupancyGrid, dilate, pad
 from dsom_jax.proposals.likelihood_grid import LikelihoodGrid, beam_choice
 from dsom_jax.proposals.markov_grid import normalised
@@ -36,92 +37,8 @@ _FAINT = 1e-7
 """Share of the mass below which a row is empty."""
 _AWAY = 0.02
 """Mass off the map from which on the whole grid is judged."""
-_BLOCK = 64
 _NEWS = 0.25
 """Novelty of a scan below which the belief waits for more."""
-
-
-@dataclass(frozen=True)
-class GridBeliefConfig:
-    """How the belief moves and what it believes of a scan (static).
-
-    Attributes:
-        beams: beams that are judged, spread evenly over the scan.
-        temper: factor on a scan's log-likelihood.
-        kidnap: probability of being carried anywhere between two updates.
-        slip: probability that the robot stood still, or drove back what the odometry reports as forth.
-        leave: probability of leaving the map at an update.
-        enter: probability of coming back to it.
-        explained: off the map a scan is as likely as on it where the map explains this share of the beams; of cells
-            and heading bins, so that even the right one explains half of a clean scan.
-        fits: log-likelihood of a beam below which a focus is not trusted, and the whole grid judged.
-        rows: number of cells that a focus holds.
-        reach: cells around where the odometry takes the mass that the focus goes on to hold.
-        pool: cells that are drawn to stand for the belief.
-        samples: how many of them tell places apart.
-    """
-
-    beams: int = 60
-    temper: float = 0.1
-    kidnap: float = 1e-9
-    slip: float = 0.1
-    leave: float = 1e-4
-    enter: float = 0.02
-    explained: float = 0.2
-    fits: float = -1.7
-    rows: int = 256
-    reach: int = 2
-    pool: int = 2048
-    samples: int = 512
-
-    def __post_init__(self) -> None:
-        checks.count(self, "beams rows reach pool samples")
-        checks.positive(self, "temper")
-        checks.share(self, "kidnap leave enter explained", excluding="()")
-        checks.share(self, "slip", excluding=")")
-        checks.finite(self, "fits")
-
-
-class Memory(NamedTuple):
-    """The belief after an update.
-
-    Attributes:
-        mass: (C, K) by free cell and heading; means nothing while ``held``.
-        rows: (M,) cells of the focus, C where there are fewer.
-        focus: (M, K) mass of these; all that there is on the map while ``held``.
-        held: () bool, the focus holds the belief, not ``mass``.
-        focused: () bool, it does, and the scan fits there.
-        off: () mass off the map; all of it sums to one.
-        pool: what was drawn of it.
-        scan: (B,) the last one that counted, to tell what is new in the next.
-        pending: (3,) motion since then, in the base frame of then.
-    """
-
-    mass: Array
-    rows: Array
-    focus: Array
-    held: Array
-    focused: Array
-    off: Array
-    pool: Pool
-    scan: Array
-    pending: Array
-
-
-class Places(NamedTuple):
-    """What an update makes of the belief, for particles and for the verdict.
-
-    Attributes:
-        pool: cells that stand for it.
-        poses: (S, 3) base poses of some of them, each with 1 / S of the mass on the map.
-        off: () mass off the map.
-        novelty: () how much of the scan counted.
-    """
-
-    pool: Pool
-    poses: Array
-    off: Array
-    novelty: Array
 
 
 class _Judged(NamedTuple):
@@ -187,7 +104,7 @@ class GridBelief:
         unseen = jnp.isnan(memory.scan).all()  # as after a pose that was told
         fresh = jnp.where(first | unseen, 1.0, novelty(memory.scan, inputs.ranges, odometry))
         counts = fresh > _NEWS
-        rows, fits = self._reachable(memory, odometry)
+        rows, fits = reachable(self.likelihood, self.row_of, memory.rows, memory.focus, odometry, self.config.reach)
         near = memory.focused & fits & ~first
         judged = jax.lax.cond(counts & near, self._near, self._waiting, memory, rows, odometry, inputs.ranges, fresh)
         # A loop of one turn or none: unlike a branch, it leaves the mass of the whole grid where it is.
@@ -292,28 +209,6 @@ class GridBelief:
         share = self.config.explained
         return share * math.log(hit + other) + (1 - share) * math.log(other)
 
-    def _swing(self, odometry: Array) -> Array:
-        """Metres that a turn of the base moves a sensor beside its axle."""
-        x, y, _ = self.likelihood.lidar.mount
-        return math.hypot(x, y) * jnp.abs(odometry[2])
-
-    def _reachable(self, memory: Memory, odometry: Array) -> tuple[Array, Array]:
-        """Rows (M,) that the mass of the focus can reach in one update, and whether they are all there."""
-        grid = self.likelihood.pose_grid
-        cells = self.likelihood.cells.at[memory.rows].get(mode="fill", fill_value=grid.height * grid.width)
-        i, j = jnp.divmod(cells, grid.width)
-        heading = pg.heading(grid, jnp.argmax(memory.focus, -1))
-        across, along = (v / grid.resolution for v in rotate(heading, odometry[0], odometry[1])[::-1])
-        image = jnp.zeros((grid.height, grid.width), bool)
-        for way in (1.0, -1.0, 0.0):
-            y, x = jnp.round(i + way * across).astype(jnp.int32), jnp.round(j + way * along).astype(jnp.int32)
-            there = (cells < grid.height * grid.width) & (y >= 0) & (x >= 0)
-            image = image.at[jnp.where(there, y, grid.height), x].set(True, mode="drop")
-        image = dilate(image, self.config.reach) & self.likelihood.free
-        cells = first_set(image.reshape(-1), self.config.rows)
-        swings = self._swing(odometry) > (self.config.reach - 2) * grid.resolution
-        return self.row_of[cells], (image.sum() <= self.config.rows) & ~swings
-
     def sample(self, key: Key, prepared: Places, n: int) -> tuple[Array, Array]:
         """``n`` base poses (n, 3) from the belief after the scan, and their log densities."""
         poses, _, log_q = self.draw(key, prepared, n)
@@ -337,20 +232,6 @@ def grid_belief(likelihood: LikelihoodGrid, grid: OccupancyGrid, config: GridBel
     at_edge = (dilate(_unknown(likelihood, grid), 2) & likelihood.free).reshape(-1)
     frontier = at_edge.at[cells].get(mode="fill", fill_value=False).astype(jnp.float32)[:, None]
     return GridBelief(likelihood, row_of, normalised(frontier), config)
-
-
-def first_set(flags: Array, count: int) -> Array:
-    """(M,) int32 where the first ``count`` of ``flags`` (n,) are set, in order; n where there are fewer.
-
-    By blocks, of which at most ``count`` are looked into: a running sum over a large map takes long.
-    """
-    n = flags.size
-    blocks = jnp.pad(flags, (0, -n % _BLOCK)).reshape(-1, _BLOCK)
-    some = jnp.flatnonzero(blocks.any(-1), size=count, fill_value=len(blocks))
-    within = blocks.at[some].get(mode="fill", fill_value=False)
-    at = jnp.flatnonzero(within.reshape(-1), size=count, fill_value=within.size)
-    block = some.at[at // _BLOCK].get(mode="fill", fill_value=len(blocks))
-    return jnp.minimum(block * _BLOCK + at % _BLOCK, n).astype(jnp.int32)
 
 
 def _unknown(likelihood: LikelihoodGrid, grid: OccupancyGrid) -> Array:

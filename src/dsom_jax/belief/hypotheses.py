@@ -8,7 +8,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from dsom_jax.geometry import mean_pose, pose_covariance
+from dsom_jax.geometry import mean_pose, pose_covariance, wrap_angle
 from dsom_jax.types import Array
 
 PLACES = 8
@@ -59,7 +59,7 @@ def gather(poses: Array, mass: Array, count: int = PLACES) -> Hypotheses:
 
 def share_at(poses: Array, place: Array) -> Array:
     """Share () of poses (S, 3) that belong to ``place`` (3,)."""
-    return _near(poses, place).mean()
+    return _near(poses, place.at[2].set(wrap_angle(place[2]))).mean()
 
 
 def _near(poses: Array, place: Array) -> Array:

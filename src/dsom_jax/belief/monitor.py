@@ -12,8 +12,7 @@ import jax.numpy as jnp
 
 from dsom_jax.geometry import relative, wrap_angle
 from dsom_jax.lidar import LidarConfig
-from dsom_jax.marching import empty_squares
-from dsom_jax.raycast import MapTables, cast_rays
+from dsom_jax.raycast import MapTables, RaycastConfig, cast_rays, leaps
 from dsom_jax.types import Array
 
 _UNTRIED = 0.45
@@ -75,7 +74,8 @@ class Track(NamedTuple):
         cross, along, squared: () faded sums of reported x answered steps: crosswise, along, and of the reported ones;
             a step that was answered backwards counts as one forth, as some encoders do not tell the two apart.
         back, path: () metres answered backwards, and all, in the last minutes.
-        driven: () metres reported since the start, and a little for what was turned.
+        driven: () metres since the start that were both reported and answered, and a little for what was turned;
+            metres answered where nothing was reported, as by an odometry that is not connected.
         slide, turn: () faded sums of squared gaps between reported and answered steps (m^2) and turns (rad^2).
         steps: () faded number of steps.
         jump: () faded number of steps that no odometry explains.
@@ -198,6 +198,8 @@ class Monitor:
         jumped = (off > jnp.maximum(1.0, 1.5 * travel)) | (jnp.abs(gap) > 0.7)
         keep = jnp.where(first, 0.0, self.slow)
         use = jnp.where(first | jumped, 0.0, 1.0)
+        way = jnp.hypot(x, y)
+        shown = jnp.where((odometry == 0).all(), way, jnp.minimum(travel, way) + _SPUN * jnp.abs(odometry[2]))
         long = jnp.where(first, 0.0, _MINUTES)
         return track._replace(
             cross=keep * track.cross + use * (told[0] * y - told[1] * x),
@@ -205,7 +207,7 @@ class Monitor:
             squared=keep * track.squared + use * travel**2,
             back=long * track.back + use * travel * backward,
             path=long * track.path + use * travel,
-            driven=jnp.where(first, 0.0, track.driven + travel + _SPUN * jnp.abs(odometry[2])),
+            driven=jnp.where(first, 0.0, track.driven + use * shown),
             slide=keep * track.slide + use * jnp.where(use > 0, off, 0.0) ** 2,
             turn=keep * track.turn + use * gap**2,
             steps=keep * track.steps + use,
@@ -242,5 +244,5 @@ def monitor(tables: MapTables, lidar: LidarConfig, beams: int = 120) -> Monitor:
     """Monitor on a map, looking at about ``beams`` beams of a scan."""
     step = max(1, lidar.beams // beams)
     grid = replace(tables.grid, occupied=~tables.grid.free)
-    squares = empty_squares(jnp.pad(grid.occupied, 1, constant_values=True), 63)
-    return Monitor(tables, replace(tables, grid=grid, empty=squares, walls=None), lidar.every(step), step)
+    seen = replace(tables, grid=grid, empty=leaps(grid.occupied, RaycastConfig()), walls=None)
+    return Monitor(tables, seen, lidar.every(step), step)

@@ -27,20 +27,27 @@ def moved_mass(
     the probability that the robot stood still, or drove back what is reported as forth.
     """
     grid = likelihood.pose_grid
-    mount = jnp.array(likelihood.lidar.mount)[:2]
-    # Cells are those of the sensor, which a turn of the base moves, too.
-    swing = jnp.stack(rotate(odometry[2], *mount)) - mount
-    theta = pg.heading(grid, jnp.arange(grid.headings))
     padded = jnp.pad(mass, ((0, 1), (0, 0)))
-    forth, back = (
-        jnp.stack(rotate(theta, *step)[::-1]) / grid.resolution
-        for step in (swing + odometry[:2], swing - odometry[:2])
-    )
+    forth, back = steps_of(likelihood, odometry, pg.heading(grid, jnp.arange(grid.headings)))
     moved = (1 - slip) * _shifted(grid, padded, slot, cells, forth)
     # Slips are rare and need no interpolation.
     slipped = _taken(grid, padded, slot, cells, jnp.round(back).astype(jnp.int32))
     slipped = slipped + _taken(grid, padded, slot, cells, jnp.zeros_like(back, jnp.int32))
     return turned(moved + slip / 2 * slipped, odometry[2] / grid.turn)
+
+
+def steps_of(likelihood: LikelihoodGrid, odometry: Array, theta: Array) -> tuple[Array, Array]:
+    """Cells (2, n) along y and x that a base of heading ``theta`` (n,) takes its sensor, driving forth, and back.
+
+    The turn of ``odometry`` (3,) is the same in both; it swings a sensor that does not sit on the axle.
+    """
+    mount = jnp.array(likelihood.lidar.mount)[:2]
+    swing = jnp.stack(rotate(odometry[2], *mount)) - mount
+    resolution = likelihood.pose_grid.resolution
+    forth, back = (
+        jnp.stack(rotate(theta, *step)[::-1]) / resolution for step in (swing + odometry[:2], swing - odometry[:2])
+    )
+    return forth, back
 
 
 def _shifted(grid: pg.PoseGrid, padded: Array, slot: Array | None, cells: Array, shift: Array) -> Array:

@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from dsom_jax.belief.grid_belief import GridBelief, Places
+from dsom_jax.belief.grid_belief import GridBelief
+from dsom_jax.belief.grid_memory import Places
 from dsom_jax.belief.hypotheses import Hypotheses, gather, share_at
 from dsom_jax.belief.monitor import Monitor, Signs, Track
 from dsom_jax.belief.verdict import Head, Verdict, judge, p_lost

@@ -18,7 +18,8 @@ import jax
 import jax.numpy as jnp
 
 from dsom_jax import checks
-from dsom_jax.belief.grid_belief import GridBelief, Places
+from dsom_jax.belief.grid_belief import GridBelief
+from dsom_jax.belief.grid_memory import Places
 from dsom_jax.belief.hypotheses import share_at
 from dsom_jax.filters.adam_robust import AdamRobust, Draw, RobustState
 from dsom_jax.filters.common import Info

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from dsom_jax import checks
-from dsom_jax.belief.grid_belief import GridBeliefConfig
+from dsom_jax.belief.grid_memory import GridBeliefConfig
 from dsom_jax.filters.adam_robust import RobustConfig
 from dsom_jax.lidar import LidarConfig
 from dsom_jax.motion import OdometryMotion, omni_like

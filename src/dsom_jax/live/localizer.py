@@ -174,7 +174,7 @@ class Localizer:
         self._memory, self._states, told = self._step(
             self._filter, self._keys, self._memory, self._states, inputs, _ONCE
         )
-        info, covariance = jax.tree.map(np.asarray, told)  # a tenth of what device_get takes
+        info, covariance = jax.tree.map(np.asarray, told)  # on a CPU a tenth of what device_get takes
         self._index, self._forced, self.info = self._index + 1, False, info
         pose, covariance = np.asarray(info.cluster, np.float64), np.asarray(covariance, np.float64)
         p_lost, verdict, places = said(info, pose, covariance)
