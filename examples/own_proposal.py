@@ -1,4 +1,4 @@
-"""A proposal of one's own in Alg 1 of the paper: ``python examples/own_proposal.py``."""
+"""A proposal of one's own in AdaM robust: ``python examples/own_proposal.py``."""
 
 from __future__ import annotations
 

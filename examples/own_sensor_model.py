@@ -20,7 +20,7 @@ class Laplace(dj.SensorModel):
 
     def log_likelihood(self, tables, poses, ranges):
         reach = tables.lidar.range_max
-        expected = jnp.minimum(tables.expected(poses), reach)  # (N, B), +inf is no wall
+        expected = jnp.minimum(tables.expected(poses), reach)  # (..., B), +inf is no wall
         error = jnp.minimum(jnp.abs(jnp.minimum(ranges, reach) - expected), self.worst)
         valid = ranges > -jnp.inf  # neither NaN nor too close
         return -self.temper * jnp.where(valid, error / self.scale, 0.0).sum(-1)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import tiny_world
-from dsom_jax.belief.focus import first_set, reachable
+from dsom_jax.belief.focus import first_set, rows_ahead
 from dsom_jax.belief.grid_belief import grid_belief, novelty
 from dsom_jax.belief.grid_memory import GridBeliefConfig
 from dsom_jax.belief.moving import moved_everywhere
@@ -133,7 +133,7 @@ def test_evidence_is_that_of_the_beam_model_at_the_cells(tiny):
 
 
 @pytest.mark.parametrize("odometry", [(0.3, 0.0, 0.9), (-0.4, 0.2, -0.7), (0.0, 0.0, 0.0)])
-def test_all_that_a_cell_can_reach_is_reachable(odometry):
+def test_all_that_a_cell_can_reach_is_ahead(odometry):
     # A lidar that a turn of the base swings by two cells and more.
     hall = np.pad(np.zeros((22, 22), bool), 1, constant_values=True)
     grid, lidar = from_cells(hall, resolution=0.5), replace(LIDAR, mount=(1.2, 0.4, 0.3))
@@ -145,7 +145,7 @@ def test_all_that_a_cell_can_reach_is_reachable(odometry):
         mass = jnp.zeros((belief.likelihood.cells.size, 8)).at[centre, heading].set(1.0)
         moved = moved_everywhere(belief.likelihood, mass, told, belief.config.slip) * belief._real()
         focus = jnp.zeros((count, 8)).at[0, heading].set(1.0)
-        found, fits = reachable(belief.likelihood, belief.row_of, rows, focus, told, belief.config.reach)
+        found, fits = rows_ahead(belief.likelihood, belief.row_of, rows, focus, told, belief.config.reach)
         assert bool(fits) and set(np.flatnonzero(moved.sum(-1) > 1e-6)) <= set(np.asarray(found).tolist())
         assert len(set(np.asarray(found).tolist())) < 80  # three squares of five cells a side, not the whole hall
 

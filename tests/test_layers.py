@@ -30,6 +30,7 @@ LAYERS = (
         "data",
         "checkpoint",
         "run_folder",
+        "run_resume",
         "trained",
         "plotting",
         "report",
@@ -163,8 +164,6 @@ TWICE = {
     "main": "every command has one",
     **dict.fromkeys(("certify", "inspect", "localize", "train"), "a command in __main__.py, and what it does"),
     **dict.fromkeys(("compose", "relative", "inverse"), "for NumPy in data/se2.py, for JAX in geometry.py"),
-    "Draw": "new particles; what they carry beside their poses is each filter's own",
-    "start": "a filter before its first update, of one run or of all",
 }
 """Public names that may stand in several modules, and why: they are one thing."""
 

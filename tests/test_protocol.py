@@ -29,7 +29,8 @@ from dsom_jax.lidar import LidarConfig
 from dsom_jax.occupancy import from_cells
 from dsom_jax.protocol import adapting, clips, command, reporting, running
 from dsom_jax.protocol.plan import ProtocolPlan, Variant, read_plan, variants
-from dsom_jax.run_folder import load_init, read_fields
+from dsom_jax.run_folder import read_fields
+from dsom_jax.run_resume import load_init
 
 ROOT = Path(__file__).resolve().parents[1]
 FILES = ("paper_data/upo.yaml", "paper_data/bicocca.yaml", "real/paper.yaml")

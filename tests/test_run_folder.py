@@ -18,8 +18,9 @@ import pytest
 from dsom_jax import atomic, checkpoint
 from dsom_jax.errors import UserError, run_cli
 from dsom_jax.nn import DSOMConfig, create
-from dsom_jax.run_folder import LOCK, OWNER, Run, check_new, trim_log
+from dsom_jax.run_folder import LOCK, OWNER, Run, check_new
 from dsom_jax.run_folder import create_run as begin
+from dsom_jax.run_resume import trim_log
 from dsom_jax.train import TrainArgs
 from dsom_jax.trainer import Parts, open_run, train
 from dsom_jax.training.loop import TrainConfig

@@ -20,19 +20,8 @@ from dsom_jax import checkpoint
 from dsom_jax.atomic import write_atomic
 from dsom_jax.errors import UserError
 from dsom_jax.occupancy import OccupancyGrid
-from dsom_jax.run_folder import (
-    OWNER,
-    RUN,
-    FilterRun,
-    Run,
-    check_init,
-    check_new,
-    create_run,
-    load_init,
-    read_fields,
-    reopen,
-    trim_log,
-)
+from dsom_jax.run_folder import OWNER, RUN, FilterRun, Run, check_new, create_run, read_fields
+from dsom_jax.run_resume import check_init, load_init, reopen, trim_log
 
 CALIBRATION_STEPS = 30
 

@@ -13,7 +13,7 @@ from dsom_jax.types import Array
 _BLOCK = 64
 
 
-def reachable(
+def rows_ahead(
     likelihood: LikelihoodGrid, row_of: Array, rows: Array, focus: Array, odometry: Array, reach: int
 ) -> tuple[Array, Array]:
     """Rows (M,) that a focus can reach by an increment (3,) of the odometry, and whether they are all there ().

@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 
 from dsom_jax import pose_grid as pg
-from dsom_jax.belief.focus import first_set, reachable
+from dsom_jax.belief.focus import first_set, rows_ahead
 from dsom_jax.belief.grid_memory import GridBeliefConfig, Memory, Places
 from dsom_jax.belief.moving import moved_everywhere, moved_mass
 from dsom_jax.belief.pool import Pool, draw, even
@@ -104,7 +104,7 @@ class GridBelief:
         unseen = jnp.isnan(memory.scan).all()  # as after a pose that was told
         fresh = jnp.where(first | unseen, 1.0, novelty(memory.scan, inputs.ranges, odometry))
         counts = fresh > _NEWS
-        rows, fits = reachable(self.likelihood, self.row_of, memory.rows, memory.focus, odometry, self.config.reach)
+        rows, fits = rows_ahead(self.likelihood, self.row_of, memory.rows, memory.focus, odometry, self.config.reach)
         near = memory.focused & fits & ~first
         judged = jax.lax.cond(counts & near, self._near, self._waiting, memory, rows, odometry, inputs.ranges, fresh)
         # A loop of one turn or none: unlike a branch, it leaves the mass of the whole grid where it is.

@@ -21,7 +21,7 @@ from dsom_jax import checks
 from dsom_jax.belief.grid_belief import GridBelief
 from dsom_jax.belief.grid_memory import Places
 from dsom_jax.belief.hypotheses import share_at
-from dsom_jax.filters.adam_robust import AdamRobust, Draw, RobustState
+from dsom_jax.filters.adam_robust import AdamRobust, Component, RobustState
 from dsom_jax.filters.common import Info
 from dsom_jax.occupancy import is_free
 from dsom_jax.proposals.markov_grid import MarkovGrid, Recollection
@@ -78,12 +78,12 @@ class AdamPlaces(AdamMemory):
 
     proposal: GridBelief  # type: ignore[assignment]  # in place of the memory that judges the whole grid every time
 
-    def _redraw(self, key: Key, state: RobustState, low: Array, prepared: Places) -> Draw:
+    def _redraw(self, key: Key, state: RobustState, low: Array, prepared: Places) -> Component:
         """L: from the pool of the belief, which knows what it believed of each before the scan."""
         poses, log_prior, log_q = self.proposal.draw(key, prepared, self.config.particles)
         share = jnp.where(state.updates == 0, 0.0, jnp.log(self._share(state)))
         stands = is_free(self.world.grid, poses)
-        return Draw(poses, share + jnp.where(stands, log_prior - log_q, -jnp.inf) - jnp.log(low.sum()))
+        return Component(poses, share + jnp.where(stands, log_prior - log_q, -jnp.inf) - jnp.log(low.sum()))
 
     def _worth(self, state: RobustState, prepared: Places) -> Array:
         """Less while lost, and less of a scan that is not new; a little, so that particles stay where it holds them."""

@@ -74,7 +74,7 @@ class RobustState(NamedTuple):
     updates: Array
 
 
-class Draw(NamedTuple):
+class Component(NamedTuple):
     """Poses (N, 3) of one component and log(prior density / (proposal density * number of draws)) (N,)."""
 
     poses: Array
@@ -151,7 +151,7 @@ class AdamRobust:
         count = jnp.maximum(jnp.round(share * self.config.particles), 1)
         return jnp.where(state.updates == 0, self.config.particles, count).astype(jnp.int32)
 
-    def _keep(self, key: Key, state: RobustState, low: Array, inputs: Inputs) -> Draw:
+    def _keep(self, key: Key, state: RobustState, low: Array, inputs: Inputs) -> Component:
         """H: resample systematically by r, move."""
         k_resample, k_move = jax.random.split(key)
         log_r = resampling_log_weights(state.log_weights, self.config.flatten)
@@ -159,12 +159,12 @@ class AdamRobust:
         rank = jnp.maximum(jnp.cumsum(~low) - 1, 0)
         ancestors = pick(jnp.cumsum(jnp.exp(log_r)), (rank + jax.random.uniform(k_resample)) / count)
         poses = self.world.motion.sample(k_move, state.poses[ancestors], inputs.odometry)
-        return Draw(poses, self._log_kept(state) + (state.log_weights - log_r)[ancestors] - jnp.log(count))
+        return Component(poses, self._log_kept(state) + (state.log_weights - log_r)[ancestors] - jnp.log(count))
 
-    def _redraw(self, key: Key, state: RobustState, low: Array, prepared: Any) -> Draw:
+    def _redraw(self, key: Key, state: RobustState, low: Array, prepared: Any) -> Component:
         """L: draw from q."""
         poses, log_q = self.proposal.sample(key, prepared, self.config.particles)
-        return Draw(poses, self._log_redrawn(state, poses, prepared) - log_q - jnp.log(low.sum()))
+        return Component(poses, self._log_redrawn(state, poses, prepared) - log_q - jnp.log(low.sum()))
 
     def _log_kept(self, state: RobustState) -> Array:
         """Share of the prior that H stands for: log(1 - eps)."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from dsom_jax import checks
 from dsom_jax.filters.common import Info, ParticleState
-from dsom_jax.filters.updates import Draw, FilterConfig, conclude, resample_and_move, start
+from dsom_jax.filters.updates import Draw, FilterConfig, conclude, even_particles, resample_and_move
 from dsom_jax.filters.world import World
 from dsom_jax.types import Array, Inputs, Key
 
@@ -43,7 +43,7 @@ class MCL:
 
     def init(self, key: Key) -> ParticleState:
         """Uniform particles."""
-        return start(key, self.world, self.config)
+        return even_particles(key, self.world, self.config)
 
     def step(self, key: Key, state: ParticleState, inputs: Inputs, prepared: None) -> tuple[ParticleState, Info]:
         """One update."""

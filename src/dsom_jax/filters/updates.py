@@ -51,7 +51,7 @@ class Draw(NamedTuple):
     weights: Array
 
 
-def start(key: Key, world: World, config: FilterConfig) -> ParticleState:
+def even_particles(key: Key, world: World, config: FilterConfig) -> ParticleState:
     """Uniform particles over free space: no prior."""
     poses, _ = world.space.sample(key, None, config.particles)
     even = jnp.full((config.particles,), 1.0 / config.particles, jnp.float32)
@@ -197,4 +197,4 @@ class SharedProposal:
 
     def init(self, key: Key) -> ParticleState:
         """Uniform particles."""
-        return start(key, self.world, self.config)
+        return even_particles(key, self.world, self.config)
